@@ -1,0 +1,12 @@
+//! Rigid motions, closed-form fits, robust kernels, voxel grids and the neighbour index. Uses nothing of ours.
+//!
+//! Conventions, said once: metres and radians; `b_from_a` maps points of frame `a` into frame `b`
+//! (`x_b = R x_a + t`), products read right to left and adjacent names cancel; perturbations act on the left:
+//! `exp(xi) * b_from_a` with `xi = [rotation (rad); translation (m)]`.
+
+mod pose;
+
+pub use pose::{Pose, PoseError};
+
+/// A point or direction in single precision, local to its scan. Metres.
+pub type Point = [f32; 3];

@@ -1,0 +1,103 @@
+//! A model as plain data: what a version holds, what is stored, and what readers see.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::cloud::ScanKey;
+use crate::geometry::Pose;
+
+/// Why a scan is in no component.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "reason", rename_all = "kebab-case")]
+pub enum WaitingReason {
+    /// No other scan is there yet.
+    OnlyScan,
+    /// No pair with another scan passed verification.
+    NoVerifiedPair {
+        /// Scans it was matched against.
+        tried: usize,
+        /// Support of the best candidate pose.
+        best_support: f64,
+        /// Support that a join needs.
+        needed: f64,
+    },
+    /// Candidate poses exist, but two different ones are about equally good.
+    Ambiguous {
+        /// Support of the best candidate pose.
+        best_support: f64,
+        /// Support of the best different pose.
+        rival_support: f64,
+    },
+    /// The best candidate pose puts surfaces where another scan saw free space.
+    ViolatesFreeSpace {
+        /// Violating share of the points that can be judged.
+        violation: f64,
+        /// Largest share allowed.
+        allowed: f64,
+    },
+}
+
+/// Where a scan stands in a model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "status", rename_all = "kebab-case")]
+pub enum ScanOutcome {
+    /// In a component.
+    Registered(RegisteredScan),
+    /// In none.
+    Waiting(WaitingReason),
+}
+
+/// A scan's place in a component, and how well it is held there.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RegisteredScan {
+    /// Index into [`ModelSnapshot::components`].
+    pub component: usize,
+    /// Maps points of the scan's own frame (metres, file origin) into the component's model frame.
+    pub model_from_scan: Pose,
+    /// Landmarks that this scan observes.
+    pub landmarks: usize,
+    /// Other scans of the component that overlap it in a verified edge.
+    pub neighbours: usize,
+    /// Root mean square distance between its keypoints and their landmarks, metres.
+    pub landmark_rms: f64,
+}
+
+/// One rigid piece of the model. Frames of different components are unrelated.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ComponentSummary {
+    /// Member scans, ascending by key.
+    pub scans: Vec<ScanKey>,
+    /// The scan at identity.
+    pub gauge: ScanKey,
+    /// Landmarks with at least two observations.
+    pub landmarks: usize,
+    /// Observations of those landmarks.
+    pub observations: usize,
+    /// Root mean square distance between observations and landmarks, metres.
+    pub landmark_rms: f64,
+}
+
+/// An immutable state of the model.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ModelSnapshot {
+    /// Voxel size v, metres; 0 for an empty model.
+    pub resolution: f64,
+    /// Largest first.
+    pub components: Vec<ComponentSummary>,
+    /// Every scan of the model.
+    pub scans: BTreeMap<ScanKey, ScanOutcome>,
+}
+
+impl ModelSnapshot {
+    /// As bytes for a blob.
+    #[must_use]
+    pub fn to_bytes(&self) -> Vec<u8> {
+        serde_json::to_vec(self).unwrap_or_default()
+    }
+
+    /// From the bytes of [`ModelSnapshot::to_bytes`].
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, serde_json::Error> {
+        serde_json::from_slice(bytes)
+    }
+}
