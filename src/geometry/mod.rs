@@ -4,9 +4,15 @@
 //! (`x_b = R x_a + t`), products read right to left and adjacent names cancel; perturbations act on the left:
 //! `exp(xi) * b_from_a` with `xi = [rotation (rad); translation (m)]`.
 
+#[cfg(test)]
+pub(crate) mod assert;
 mod pose;
+mod rigid_fit;
+mod robust;
 
 pub use pose::{Pose, PoseError};
+pub use rigid_fit::rigid_fit;
+pub use robust::Kernel;
 
 /// A point or direction in single precision, local to its scan. Metres.
 pub type Point = [f32; 3];
