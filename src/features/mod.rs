@@ -1,8 +1,16 @@
 //! What is computed once per scan: normals, keypoints, descriptors, global signature, and the dense structures
-//! (voxel index, range image) that verification reads.
+//! (voxel index, range image) that verification reads. Uses `cloud` and `geometry`; used by `pairwise` and above.
 
+mod fpfh;
 mod prepared;
+mod range_image;
+mod resolution;
+mod sensor;
+mod signature;
 
-pub use prepared::{
-    PrepareError, PrepareOptions, PreparedScan, SensorPosition, choose_resolution, extent, prepare,
-};
+pub use fpfh::{DESCRIPTOR_LEN, Descriptor, fpfh};
+pub use prepared::{PrepareError, PrepareOptions, PreparedScan, Scan, prepare};
+pub use range_image::{RangeImage, Visibility};
+pub use resolution::{choose_resolution, extent, natural_resolution};
+pub use sensor::{SensorPosition, Viewpoint, viewpoint};
+pub use signature::{SIGNATURE_LEN, signature};

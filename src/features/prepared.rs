@@ -1,19 +1,26 @@
-//! A scan made ready for matching.
+//! A scan made ready for matching: everything the pair and mapping layers read, in two forms. [`PreparedScan`] is plain data, to be
+//! stored; [`Scan`] adds the lookup grid, to be computed with.
 
+use nalgebra::Vector3;
+use rand::seq::index::sample;
 use serde::{Deserialize, Serialize};
 
-use crate::cloud::{PointCloud, ScanKey};
+use super::fpfh::{DESCRIPTOR_LEN, fpfh};
+use super::range_image::RangeImage;
+use super::resolution::extent;
+use super::sensor::{SensorPosition, viewpoint};
+use super::signature::signature;
+use crate::cloud::{PointCloud, ScanKey, face, normals};
 use crate::control::{Cancelled, Control, Seed};
+use crate::geometry::{NearestGrid, NeighborIndex, Point, Pose, voxel_centroids};
 
-/// Where the sensor stood while it took the scan, in the scan's own frame.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
-pub enum SensorPosition {
-    /// Nobody said: the origin of the scan's frame is assumed, tested, and given up when the points speak against it.
-    #[default]
-    Assumed,
-    /// The file or the request said where. Metres.
-    Known([f64; 3]),
-}
+/// Fewest points with normals that can be registered.
+const MIN_POINTS: usize = 200;
+/// Most voxels a scan may fill: more means that the resolution does not fit the scan.
+const MAX_POINTS: usize = 400_000;
+/// Radius of normals and of descriptors, in voxels.
+const NORMAL_RADIUS: f32 = 2.0;
+const DESCRIPTOR_RADIUS: f32 = 5.0;
 
 /// How scans are prepared. Scans of one model must be prepared with equal options.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -22,81 +29,196 @@ pub struct PrepareOptions {
     pub resolution: f64,
     /// Root of the random choices.
     pub seed: Seed,
+    /// Keypoints a scan, at most.
+    pub keypoints: usize,
+}
+
+impl PrepareOptions {
+    /// The defaults at a resolution in metres.
+    #[must_use]
+    pub fn at(resolution: f64, seed: Seed) -> Self {
+        Self { resolution, seed, keypoints: 2000 }
+    }
 }
 
 /// Why a scan cannot be prepared.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PrepareError {
+    /// The resolution is no length.
+    #[error("the resolution is {0} m, but must be positive and finite")]
+    Resolution(f64),
     /// Too few points remain for any registration.
     #[error(
-        "the scan has {found} distinct points at a resolution of {resolution} m; registration needs at least {needed}"
+        "the scan has {found} distinct surface points at a resolution of {resolution} m; registration needs at least {needed}"
     )]
     TooFewPoints {
-        /// Occupied voxels.
+        /// Occupied voxels with a normal.
         found: usize,
         /// The least number.
         needed: usize,
         /// Voxel size, metres.
         resolution: f64,
     },
-    /// All points lie on one spot or one line.
-    #[error("the scan's points span no surface: its extent is {extent} m")]
-    NoExtent {
-        /// Diagonal of the 2-98 % box, metres.
-        extent: f64,
+    /// Far too many voxels.
+    #[error(
+        "the scan fills {found} voxels at a resolution of {resolution} m, more than {limit}: the resolution is too fine for it"
+    )]
+    TooManyPoints {
+        /// Occupied voxels.
+        found: usize,
+        /// The largest number.
+        limit: usize,
+        /// Voxel size, metres.
+        resolution: f64,
     },
     /// Stopped by the caller.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
 }
 
-/// A scan made ready for matching: serialisable, and a pure function of (cloud, sensor, options).
+/// A scan made ready for matching: serialisable, and a pure function of (cloud, sensor position, options).
+///
+/// Its points live in the *local* frame: the axes of the scan's own frame, shifted by `origin` so that single precision holds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PreparedScan {
     /// Which scan.
     pub key: ScanKey,
+    /// Voxel size v, metres.
+    pub resolution: f64,
+    /// Where the local frame's origin lies in the scan's own frame, metres.
+    pub origin: [f64; 3],
+    /// One point a voxel, metres.
+    pub points: Vec<Point>,
+    /// Unit normals of `points`, facing the sensor.
+    pub normals: Vec<Point>,
+    /// Indices of the keypoints in `points`, ascending.
+    pub keypoints: Vec<u32>,
+    /// Descriptors of the keypoints, one after the other, each [`DESCRIPTOR_LEN`] long.
+    pub descriptors: Vec<f32>,
+    /// The global signature.
+    pub signature: Vec<f32>,
+    /// What the sensor saw, when its position is known well enough.
+    pub range_image: Option<RangeImage>,
+    /// Where the sensor stood, as far as known; normals face it. Metres, local frame.
+    pub viewpoint: Point,
+    /// Share of the points that are hidden from the viewpoint.
+    pub hidden_share: f64,
 }
 
 impl PreparedScan {
     /// As bytes for a blob.
-    #[must_use]
-    pub fn to_bytes(&self) -> Vec<u8> {
-        postcard::to_stdvec(self).unwrap_or_default()
+    pub fn to_bytes(&self) -> Result<Vec<u8>, postcard::Error> {
+        postcard::to_stdvec(self)
     }
 
     /// From the bytes of [`PreparedScan::to_bytes`].
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, postcard::Error> {
         postcard::from_bytes(bytes)
     }
+
+    /// Maps the scan's own frame into the local frame of `points`.
+    #[must_use]
+    pub fn local_from_scan(&self) -> Pose {
+        Pose::from_translation(-Vector3::from(self.origin))
+    }
 }
 
-/// The extent of a scan: the diagonal of the box between the 2nd and 98th percentile of each coordinate, metres.
-#[must_use]
-pub fn extent(_cloud: &PointCloud) -> f64 {
-    1.0
+/// A prepared scan with what is computed with it.
+#[derive(Debug, Clone)]
+pub struct Scan {
+    /// The data.
+    pub prepared: PreparedScan,
+    /// Nearest points by position.
+    pub grid: NearestGrid,
+    /// Mean of the points, metres, local frame.
+    pub centroid: Vector3<f64>,
+    /// Root mean square distance of the points from their mean, metres.
+    pub rms_radius: f64,
 }
 
-/// The resolution (voxel size, metres) for scans of these extents (metres): their median / 75, rounded to a ladder so that
-/// one more scan seldom changes it. The order of `extents` does not matter. Panics never; an empty slice gives 0.05.
-#[must_use]
-pub fn choose_resolution(_extents: &[f64]) -> f64 {
-    0.05
+impl Scan {
+    /// Builds the lookup structures.
+    #[must_use]
+    pub fn new(prepared: PreparedScan) -> Self {
+        let grid = NearestGrid::new(&prepared.points, prepared.resolution as f32);
+        let n = prepared.points.len().max(1) as f64;
+        let position = |p: &Point| Vector3::from(*p).cast::<f64>();
+        let centroid = prepared.points.iter().map(position).sum::<Vector3<f64>>() / n;
+        let square = prepared.points.iter().map(|p| (position(p) - centroid).norm_squared()).sum::<f64>() / n;
+        Self { prepared, grid, centroid, rms_radius: square.sqrt() }
+    }
+
+    /// Which scan.
+    #[must_use]
+    pub fn key(&self) -> ScanKey {
+        self.prepared.key
+    }
+
+    /// Position of a keypoint, metres, local frame.
+    #[must_use]
+    pub fn keypoint(&self, index: usize) -> Vector3<f64> {
+        Vector3::from(self.prepared.points[self.prepared.keypoints[index] as usize]).cast()
+    }
 }
 
-/// Prepares one scan.
+/// Prepares one scan: voxels, normals towards the sensor, descriptors, keypoints, signature, range image.
 pub fn prepare(
     key: ScanKey,
     cloud: &PointCloud,
-    _sensor: SensorPosition,
+    sensor: SensorPosition,
     options: &PrepareOptions,
-    _control: Control<'_>,
+    control: Control<'_>,
 ) -> Result<PreparedScan, PrepareError> {
-    if cloud.len() < 100 {
-        return Err(PrepareError::TooFewPoints {
-            found: cloud.len(),
-            needed: 100,
-            resolution: options.resolution,
-        });
+    let resolution = options.resolution;
+    if !(resolution > 0.0 && resolution.is_finite()) {
+        return Err(PrepareError::Resolution(resolution));
     }
-    Ok(PreparedScan { key })
+    let v = resolution as f32;
+    // Half-size voxels carry the normals and the range image: finer than the result, cheaper than the raw points.
+    let fine = voxel_centroids(&cloud.points, v / 2.0);
+    control.check()?;
+    let coarse = voxel_centroids(&fine, v);
+    if coarse.len() > MAX_POINTS {
+        return Err(PrepareError::TooManyPoints { found: coarse.len(), limit: MAX_POINTS, resolution });
+    }
+    let raw_normals = normals(&coarse, &fine, &NeighborIndex::new(&fine), NORMAL_RADIUS * v);
+    control.check()?;
+
+    let frame_origin = cloud.origin.map(|x| -x as f32);
+    let view = viewpoint(&fine, sensor, frame_origin, v, extent(&fine) as f32);
+    control.check()?;
+    let (points, normals): (Vec<Point>, Vec<Point>) = coarse
+        .iter()
+        .zip(raw_normals)
+        .filter_map(|(point, normal)| normal.map(|n| (*point, face(n, point, &view.position))))
+        .unzip();
+    if points.len() < MIN_POINTS {
+        return Err(PrepareError::TooFewPoints { found: points.len(), needed: MIN_POINTS, resolution });
+    }
+    let all = fpfh(&points, &normals, DESCRIPTOR_RADIUS * v);
+    control.check()?;
+    let mut rng = options.seed.derive("keypoints", key.0);
+    let mut keypoints: Vec<u32> = sample(&mut rng, points.len(), options.keypoints.min(points.len()))
+        .into_iter()
+        .map(|index| index as u32)
+        .collect();
+    keypoints.sort_unstable();
+    let mut descriptors = Vec::with_capacity(keypoints.len() * DESCRIPTOR_LEN);
+    for &keypoint in &keypoints {
+        descriptors.extend_from_slice(&all[keypoint as usize]);
+    }
+    let signature = signature(&all);
+    Ok(PreparedScan {
+        key,
+        resolution,
+        origin: cloud.origin,
+        points,
+        normals,
+        keypoints,
+        descriptors,
+        signature,
+        range_image: view.range_image,
+        viewpoint: view.position,
+        hidden_share: view.hidden_share,
+    })
 }

@@ -6,13 +6,19 @@
 
 #[cfg(test)]
 pub(crate) mod assert;
+mod nearest_grid;
+mod neighbors;
 mod pose;
 mod rigid_fit;
 mod robust;
+mod voxel_grid;
 
+pub use nearest_grid::NearestGrid;
+pub use neighbors::NeighborIndex;
 pub use pose::{Pose, PoseError};
 pub use rigid_fit::rigid_fit;
 pub use robust::Kernel;
+pub use voxel_grid::{cell_of, occupied_voxels, voxel_centroids, voxel_groups};
 
 /// A point or direction in single precision, local to its scan. Metres.
 pub type Point = [f32; 3];

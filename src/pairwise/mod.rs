@@ -1,5 +1,17 @@
-//! Two scans: matching, consensus, hypotheses, dense and free-space verification, refinement of the pair.
+//! Two scans: matching, consensus, hypotheses, dense and free-space verification, refinement of the pair. Uses `features`;
+//! used by `graph` and `mapping`.
 
+pub mod calibration;
+mod consensus;
+mod dense;
+mod icp;
+mod matching;
 mod pair;
+mod verifier;
 
-pub use pair::{PairKey, PairResult};
+pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, centred_difference, consensus};
+pub use dense::{Counts, look, quick_overlap};
+pub use icp::{icp, perturbed_about};
+pub use matching::{Match, mutual_matches};
+pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};
+pub use verifier::{Evidence, FEATURES, Logistic, Verifier, shipped_verifier};

@@ -1,0 +1,219 @@
+//! What a sensor saw, as a cube map of depths: six pinhole faces around the sensor, so that a depth camera and a
+//! panoramic scanner are the same code and no direction is special.
+
+use serde::{Deserialize, Serialize};
+
+use crate::geometry::Point;
+
+/// Pixels of the finest image are this wide at unit depth (tangent of the angle); coarser images come from distance.
+const PIXEL_RANGE: (f32, f32) = (0.002, 0.02);
+/// Half the width of a face, as a tangent: slightly over 45 degrees, so that a 3 x 3 window never leaves its face.
+const HALF_WIDTH: f32 = 1.04;
+/// Of the nine pixels around one, this many must have depths for it to be judged.
+const MIN_FILLED: usize = 5;
+/// Depth tolerance: a part that follows the voxel size and a part that follows the pixel's footprint.
+const MARGIN_VOXELS: f32 = 2.0;
+const MARGIN_PIXELS: f32 = 1.5;
+
+/// How a point relates to what the sensor saw in its direction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Visibility {
+    /// The sensor saw nothing there (out of its view, or too few returns).
+    Unknown,
+    /// The sensor saw a surface clearly behind the point: the point stands in free space.
+    InFront,
+    /// The sensor saw a surface at the point's depth.
+    OnSurface,
+    /// The sensor saw a surface in front of the point.
+    Hidden,
+}
+
+/// One face: a rectangle of pixels that covers what was seen through it.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+struct Face {
+    column: u32,
+    row: u32,
+    columns: u32,
+    rows: u32,
+    /// Least depth in each pixel's 3 x 3 window, or 0 where too little was seen. Metres along the face's axis.
+    depths: Vec<f32>,
+}
+
+/// The range image of a scan as seen from one point.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct RangeImage {
+    sensor: Point,
+    pixel: f32,
+    margin: f32,
+    faces: Vec<Face>,
+}
+
+impl RangeImage {
+    /// Renders `points` as seen from `sensor` (both in the scan's frame, metres), with pixels as wide as a voxel of
+    /// `resolution` metres at the median depth.
+    #[must_use]
+    pub fn render(points: &[Point], sensor: Point, resolution: f32) -> Self {
+        let mut depths: Vec<f32> =
+            points.iter().filter_map(|p| project(p, &sensor)).map(|(_, _, d)| d).collect();
+        let middle = depths.len() / 2;
+        let median =
+            if depths.is_empty() { 1.0 } else { *depths.select_nth_unstable_by(middle, f32::total_cmp).1 };
+        let pixel = (resolution / median).clamp(PIXEL_RANGE.0, PIXEL_RANGE.1);
+        let width = (2.0 * HALF_WIDTH / pixel).ceil() as u32;
+        let mut hits: Vec<Vec<(u32, u32, f32)>> = vec![Vec::new(); 6];
+        for (face, at, depth) in points.iter().filter_map(|p| project(p, &sensor)) {
+            let [column, row] = at.map(|t| (((t + HALF_WIDTH) / pixel) as u32).min(width - 1));
+            hits[face].push((column, row, depth));
+        }
+        let faces = hits.iter().map(|hits| Face::from_hits(hits, width)).collect();
+        Self { sensor, pixel, margin: MARGIN_VOXELS * resolution, faces }
+    }
+
+    /// Where the sensor stood, in the scan's frame, metres.
+    #[must_use]
+    pub fn sensor(&self) -> Point {
+        self.sensor
+    }
+
+    /// Judges a point given in the scan's frame, metres.
+    #[inline]
+    #[must_use]
+    pub fn judge(&self, point: &Point) -> Visibility {
+        let Some((face, at, depth)) = project(point, &self.sensor) else { return Visibility::Unknown };
+        let [column, row] = at.map(|t| ((t + HALF_WIDTH) / self.pixel) as u32);
+        let seen = self.faces[face].depth(column, row);
+        if seen <= 0.0 {
+            return Visibility::Unknown;
+        }
+        let margin = self.margin + MARGIN_PIXELS * self.pixel * depth;
+        if depth < seen - margin {
+            Visibility::InFront
+        } else if depth > seen + margin {
+            Visibility::Hidden
+        } else {
+            Visibility::OnSurface
+        }
+    }
+
+    /// The share of the scan's own points that lie hidden behind others. A sensor sees what it scans, so a large share
+    /// says that it did not stand here.
+    #[must_use]
+    pub fn hidden_share(&self, points: &[Point]) -> f64 {
+        let (mut judged, mut hidden) = (0_usize, 0_usize);
+        for point in points {
+            match self.judge(point) {
+                Visibility::Unknown => {}
+                Visibility::Hidden => {
+                    judged += 1;
+                    hidden += 1;
+                }
+                Visibility::InFront | Visibility::OnSurface => judged += 1,
+            }
+        }
+        hidden as f64 / judged.max(1) as f64
+    }
+}
+
+impl Face {
+    fn from_hits(hits: &[(u32, u32, f32)], width: u32) -> Self {
+        if hits.is_empty() {
+            return Self::default();
+        }
+        let span = |of: fn(&(u32, u32, f32)) -> u32| {
+            hits.iter().map(of).fold((u32::MAX, 0), |(low, high), x| (low.min(x), high.max(x)))
+        };
+        let (columns, rows) = (span(|h| h.0), span(|h| h.1));
+        let (column, row) = (columns.0.saturating_sub(1), rows.0.saturating_sub(1));
+        let (columns, rows) = ((columns.1 + 2).min(width) - column, (rows.1 + 2).min(width) - row);
+        let mut nearest = vec![f32::INFINITY; (columns * rows) as usize];
+        for &(x, y, depth) in hits {
+            let pixel = &mut nearest[((y - row) * columns + (x - column)) as usize];
+            *pixel = pixel.min(depth);
+        }
+        let mut depths = vec![0.0; nearest.len()];
+        for y in 0..rows {
+            for x in 0..columns {
+                let mut least = f32::INFINITY;
+                let mut filled = 0;
+                for wy in y.saturating_sub(1)..(y + 2).min(rows) {
+                    for wx in x.saturating_sub(1)..(x + 2).min(columns) {
+                        let depth = nearest[(wy * columns + wx) as usize];
+                        if depth.is_finite() {
+                            filled += 1;
+                            least = least.min(depth);
+                        }
+                    }
+                }
+                if filled >= MIN_FILLED {
+                    depths[(y * columns + x) as usize] = least;
+                }
+            }
+        }
+        Self { column, row, columns, rows, depths }
+    }
+
+    #[inline]
+    fn depth(&self, column: u32, row: u32) -> f32 {
+        let (x, y) = (column.wrapping_sub(self.column), row.wrapping_sub(self.row));
+        if x < self.columns && y < self.rows { self.depths[(y * self.columns + x) as usize] } else { 0.0 }
+    }
+}
+
+/// The face through which a point is seen, its two tangents there, and its depth along the face's axis.
+#[inline]
+fn project(point: &Point, sensor: &Point) -> Option<(usize, [f32; 2], f32)> {
+    let d: [f32; 3] = std::array::from_fn(|k| point[k] - sensor[k]);
+    let size = d.map(f32::abs);
+    let axis = if size[0] >= size[1] && size[0] >= size[2] {
+        0
+    } else if size[1] >= size[2] {
+        1
+    } else {
+        2
+    };
+    let depth = size[axis];
+    if !(depth > 1e-9 && depth.is_finite()) {
+        return None;
+    }
+    let face = axis * 2 + usize::from(d[axis] < 0.0);
+    let others = [(axis + 1) % 3, (axis + 2) % 3];
+    Some((face, others.map(|k| d[k] / depth), depth))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A wall 2 m in front of the sensor along x, seen densely.
+    fn wall() -> RangeImage {
+        let points: Vec<Point> = (0..10_000)
+            .map(|i| [2.0, (i % 100) as f32 * 0.02 - 1.0, (i / 100) as f32 * 0.02 - 1.0])
+            .collect();
+        RangeImage::render(&points, [0.0; 3], 0.04)
+    }
+
+    #[test]
+    fn points_before_on_and_behind_a_wall_are_told_apart() {
+        let image = wall();
+        assert_eq!(image.judge(&[1.0, 0.1, 0.1]), Visibility::InFront);
+        assert_eq!(image.judge(&[2.0, 0.5, -0.5]), Visibility::OnSurface);
+        assert_eq!(image.judge(&[3.0, 0.1, 0.1]), Visibility::Hidden);
+        assert_eq!(image.judge(&[-1.0, 0.0, 0.0]), Visibility::Unknown);
+        assert_eq!(image.judge(&[2.0, 1.9, 0.0]), Visibility::Unknown);
+        assert_eq!(image.judge(&[f32::NAN, 0.0, 0.0]), Visibility::Unknown);
+    }
+
+    #[test]
+    fn a_scan_hides_nothing_from_its_own_sensor_and_much_from_a_wrong_one() {
+        let mut points = Vec::new();
+        for i in 0..5000 {
+            let (a, b) = ((i % 100) as f32 * 0.02 - 1.0, (i / 100) as f32 * 0.03);
+            points.push([a, 1.0, b]);
+            points.push([a, 1.5, b + 1.6]);
+        }
+        let right = RangeImage::render(&points, [0.0, -2.0, 0.5], 0.04).hidden_share(&points);
+        let wrong = RangeImage::render(&points, [0.0, 1.2, 8.0], 0.04).hidden_share(&points);
+        assert!(right < 0.02, "{right}");
+        assert!(wrong > right);
+    }
+}

@@ -1,0 +1,167 @@
+//! Descriptor matching: mutual nearest neighbours by blocked matrix products, ranked by how clearly each stands out.
+
+use multiversion::multiversion;
+
+use crate::features::{DESCRIPTOR_LEN, PreparedScan};
+
+/// Rows of the similarity matrix computed at a time: a block of 128 x 2000 floats stays in the second-level cache.
+const BLOCK: usize = 128;
+
+/// Two keypoints that are each other's nearest in descriptor space.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    /// Keypoint number in scan a.
+    pub a: u16,
+    /// Keypoint number in scan b.
+    pub b: u16,
+    /// How clearly it stands out: the product over both sides of (distance to the nearest / distance to the second), in
+    /// [0, 1], smaller is clearer.
+    pub ambiguity: f32,
+}
+
+/// The mutual nearest neighbours among the keypoints of two scans, clearest first, at most `limit`. Deterministic: ties are
+/// broken by keypoint number.
+#[must_use]
+pub fn mutual_matches(a: &PreparedScan, b: &PreparedScan, limit: usize) -> Vec<Match> {
+    let (rows, columns) = (a.keypoints.len(), b.keypoints.len());
+    if rows == 0 || columns == 0 {
+        return Vec::new();
+    }
+    let mut by_column = Best::new(columns);
+    let mut by_row: Vec<(f32, f32, usize)> = Vec::with_capacity(rows);
+    let mut block = vec![0.0_f32; BLOCK * columns];
+    for first in (0..rows).step_by(BLOCK) {
+        let height = BLOCK.min(rows - first);
+        similarities(&a.descriptors[first * DESCRIPTOR_LEN..], &b.descriptors, height, columns, &mut block);
+        for row in 0..height {
+            let line = &block[row * columns..(row + 1) * columns];
+            let (best, second) = top_two(line);
+            let at = line.iter().position(|x| *x == best).unwrap_or(0);
+            by_row.push((best, second, at));
+            by_column.update(line, (first + row) as u32);
+        }
+    }
+    let mut matches: Vec<Match> = by_row
+        .iter()
+        .enumerate()
+        .filter(|(row, (best, _, column))| *best > 0.0 && by_column.index[*column] as usize == *row)
+        .map(|(row, &(best, second, column))| Match {
+            a: row as u16,
+            b: column as u16,
+            ambiguity: ratio(best, second) * ratio(by_column.best[column], by_column.second[column]),
+        })
+        .collect();
+    matches.sort_by(|x, y| x.ambiguity.total_cmp(&y.ambiguity).then(x.a.cmp(&y.a)));
+    matches.truncate(limit);
+    matches
+}
+
+/// Distance ratio of two similarities of unit vectors: |x - y|^2 = 2 - 2 x.y.
+fn ratio(best: f32, second: f32) -> f32 {
+    ((1.0 - best).max(0.0) / (1.0 - second).max(1e-6)).min(1.0).sqrt()
+}
+
+/// `block[i][j] = a_i . b_j` for `height` rows of `a`.
+fn similarities(a: &[f32], b: &[f32], height: usize, columns: usize, block: &mut [f32]) {
+    assert!(a.len() >= height * DESCRIPTOR_LEN && b.len() >= columns * DESCRIPTOR_LEN);
+    assert!(block.len() >= height * columns);
+    let len = DESCRIPTOR_LEN as isize;
+    // SAFETY: the asserts above keep every access of the product, rows of `len` floats one after the other, inside its slice.
+    unsafe {
+        matrixmultiply::sgemm(
+            height,
+            DESCRIPTOR_LEN,
+            columns,
+            1.0,
+            a.as_ptr(),
+            len,
+            1,
+            b.as_ptr(),
+            1,
+            len,
+            0.0,
+            block.as_mut_ptr(),
+            columns as isize,
+            1,
+        );
+    }
+}
+
+/// The two largest values of each column seen so far, and where the largest is.
+struct Best {
+    best: Vec<f32>,
+    second: Vec<f32>,
+    index: Vec<u32>,
+}
+
+impl Best {
+    fn new(columns: usize) -> Self {
+        Self { best: vec![-1.0; columns], second: vec![-1.0; columns], index: vec![0; columns] }
+    }
+
+    fn update(&mut self, line: &[f32], row: u32) {
+        update_columns(line, row, &mut self.best, &mut self.second, &mut self.index);
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
+fn update_columns(line: &[f32], row: u32, best: &mut [f32], second: &mut [f32], index: &mut [u32]) {
+    for (((x, best), second), index) in line.iter().zip(best).zip(second).zip(index) {
+        let lower = if *x < *best { *x } else { *best };
+        *second = if lower > *second { lower } else { *second };
+        *index = if *x > *best { row } else { *index };
+        *best = if *x > *best { *x } else { *best };
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
+fn top_two(line: &[f32]) -> (f32, f32) {
+    const LANES: usize = 16;
+    let mut best = [-1.0_f32; LANES];
+    let mut second = [-1.0_f32; LANES];
+    let mut chunks = line.chunks_exact(LANES);
+    for chunk in &mut chunks {
+        for k in 0..LANES {
+            let x = chunk[k];
+            let lower = if x < best[k] { x } else { best[k] };
+            second[k] = if lower > second[k] { lower } else { second[k] };
+            best[k] = if x > best[k] { x } else { best[k] };
+        }
+    }
+    let mut top = (-1.0, -1.0);
+    for &x in best.iter().chain(&second).chain(chunks.remainder()) {
+        if x > top.0 {
+            top = (x, top.0);
+        } else if x > top.1 {
+            top.1 = x;
+        }
+    }
+    top
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn the_two_largest_are_found(line in prop::collection::vec(0.0..1.0f32, 2..200)) {
+            let mut sorted = line.clone();
+            sorted.sort_by(|a, b| b.total_cmp(a));
+            prop_assert_eq!(top_two(&line), (sorted[0], sorted[1]));
+        }
+
+        #[test]
+        fn columns_keep_their_two_largest(a in prop::collection::vec(0.0..1.0f32, 2..50)) {
+            let mut best = Best::new(1);
+            for (row, x) in a.iter().enumerate() {
+                best.update(&[*x], row as u32);
+            }
+            let mut sorted = a.clone();
+            sorted.sort_by(|x, y| y.total_cmp(x));
+            prop_assert_eq!((best.best[0], best.second[0]), (sorted[0], sorted[1]));
+            prop_assert_eq!(a[best.index[0] as usize], sorted[0]);
+        }
+    }
+}
