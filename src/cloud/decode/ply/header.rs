@@ -154,12 +154,9 @@ mod tests {
     }
 
     #[test]
-    fn declared_order_names_and_types_are_kept() {
-        let header = header(
-            "ply\nformat ascii 1.0\n\nobj_info x\nelement b 1\nproperty list uint8 float64 q\nelement a 18446744073709551615\n\
-             property short x y\nend_header\n",
-        );
-        assert!(matches!(header, Err(DecodeError::Header { .. })), "a name with a space in it is refused");
+    fn a_name_with_a_space_is_refused() {
+        let file = "ply\nformat ascii 1.0\n\nobj_info x\nelement vertex 1\nproperty short x y\nend_header\n";
+        assert!(matches!(header(file), Err(DecodeError::Header { .. })));
     }
 
     #[test]
