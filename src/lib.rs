@@ -22,5 +22,3 @@ pub mod mapping;
 
 pub mod evaluate;
 pub mod simulate;
-
-pub mod cli;
