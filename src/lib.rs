@@ -22,3 +22,5 @@ pub mod mapping;
 
 pub mod evaluate;
 pub mod simulate;
+
+pub mod cli;

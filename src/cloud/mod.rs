@@ -1,7 +1,11 @@
 //! Point clouds: the type, their decoders (bytes in, points out) and encoders, normals, downsampling, pictures.
 
+mod decode;
+mod encode;
 mod normals;
 mod point_cloud;
 
+pub use decode::{DecodeError, DecodeOptions, Decoded, Format, decode, metres_per_unit, sniff};
+pub use encode::PlyWriter;
 pub use normals::{face, normals};
 pub use point_cloud::{PointCloud, ScanKey};

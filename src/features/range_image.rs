@@ -50,9 +50,10 @@ pub struct RangeImage {
 
 impl RangeImage {
     /// Renders `points` as seen from `sensor` (both in the scan's frame, metres), with pixels as wide as a voxel of
-    /// `resolution` metres at the median depth.
+    /// `resolution` metres at the median depth. Also gives the share of the points that lie hidden behind others: a sensor sees
+    /// what it scans, so a large share says that it did not stand there.
     #[must_use]
-    pub fn render(points: &[Point], sensor: Point, resolution: f32) -> Self {
+    pub fn render(points: &[Point], sensor: Point, resolution: f32) -> (Self, f64) {
         let mut depths: Vec<f32> =
             points.iter().filter_map(|p| project(p, &sensor)).map(|(_, _, d)| d).collect();
         let middle = depths.len() / 2;
@@ -65,8 +66,23 @@ impl RangeImage {
             let [column, row] = at.map(|t| (((t + HALF_WIDTH) / pixel) as u32).min(width - 1));
             hits[face].push((column, row, depth));
         }
-        let faces = hits.iter().map(|hits| Face::from_hits(hits, width)).collect();
-        Self { sensor, pixel, margin: MARGIN_VOXELS * resolution, faces }
+        let margin = MARGIN_VOXELS * resolution;
+        let (mut judged, mut hidden) = (0_usize, 0_usize);
+        let faces = hits
+            .iter()
+            .map(|hits| {
+                let (face, farthest) = Face::from_hits(hits, width);
+                for &(column, row, depth) in hits {
+                    // Behind everything in its window: an edge or a slope alone does not make a point hidden.
+                    let seen = face.value(&farthest, column, row);
+                    judged += usize::from(seen > 0.0);
+                    hidden +=
+                        usize::from(seen > 0.0 && depth > seen + margin + MARGIN_PIXELS * pixel * depth);
+                }
+                face
+            })
+            .collect();
+        (Self { sensor, pixel, margin, faces }, hidden as f64 / judged.max(1) as f64)
     }
 
     /// Where the sensor stood, in the scan's frame, metres.
@@ -94,30 +110,13 @@ impl RangeImage {
             Visibility::OnSurface
         }
     }
-
-    /// The share of the scan's own points that lie hidden behind others. A sensor sees what it scans, so a large share
-    /// says that it did not stand here.
-    #[must_use]
-    pub fn hidden_share(&self, points: &[Point]) -> f64 {
-        let (mut judged, mut hidden) = (0_usize, 0_usize);
-        for point in points {
-            match self.judge(point) {
-                Visibility::Unknown => {}
-                Visibility::Hidden => {
-                    judged += 1;
-                    hidden += 1;
-                }
-                Visibility::InFront | Visibility::OnSurface => judged += 1,
-            }
-        }
-        hidden as f64 / judged.max(1) as f64
-    }
 }
 
 impl Face {
-    fn from_hits(hits: &[(u32, u32, f32)], width: u32) -> Self {
+    /// The face, and the greatest depth in each pixel's window.
+    fn from_hits(hits: &[(u32, u32, f32)], width: u32) -> (Self, Vec<f32>) {
         if hits.is_empty() {
-            return Self::default();
+            return (Self::default(), Vec::new());
         }
         let span = |of: fn(&(u32, u32, f32)) -> u32| {
             hits.iter().map(of).fold((u32::MAX, 0), |(low, high), x| (low.min(x), high.max(x)))
@@ -131,9 +130,11 @@ impl Face {
             *pixel = pixel.min(depth);
         }
         let mut depths = vec![0.0; nearest.len()];
+        let mut farthest = vec![0.0; nearest.len()];
         for y in 0..rows {
             for x in 0..columns {
                 let mut least = f32::INFINITY;
+                let mut greatest = 0.0_f32;
                 let mut filled = 0;
                 for wy in y.saturating_sub(1)..(y + 2).min(rows) {
                     for wx in x.saturating_sub(1)..(x + 2).min(columns) {
@@ -141,21 +142,29 @@ impl Face {
                         if depth.is_finite() {
                             filled += 1;
                             least = least.min(depth);
+                            greatest = greatest.max(depth);
                         }
                     }
                 }
                 if filled >= MIN_FILLED {
                     depths[(y * columns + x) as usize] = least;
+                    farthest[(y * columns + x) as usize] = greatest;
                 }
             }
         }
-        Self { column, row, columns, rows, depths }
+        (Self { column, row, columns, rows, depths }, farthest)
     }
 
     #[inline]
     fn depth(&self, column: u32, row: u32) -> f32 {
+        self.value(&self.depths, column, row)
+    }
+
+    /// The entry of an array over this face's pixels, 0 outside.
+    #[inline]
+    fn value(&self, of: &[f32], column: u32, row: u32) -> f32 {
         let (x, y) = (column.wrapping_sub(self.column), row.wrapping_sub(self.row));
-        if x < self.columns && y < self.rows { self.depths[(y * self.columns + x) as usize] } else { 0.0 }
+        if x < self.columns && y < self.rows { of[(y * self.columns + x) as usize] } else { 0.0 }
     }
 }
 
@@ -189,7 +198,7 @@ mod tests {
         let points: Vec<Point> = (0..10_000)
             .map(|i| [2.0, (i % 100) as f32 * 0.02 - 1.0, (i / 100) as f32 * 0.02 - 1.0])
             .collect();
-        RangeImage::render(&points, [0.0; 3], 0.04)
+        RangeImage::render(&points, [0.0; 3], 0.04).0
     }
 
     #[test]
@@ -211,8 +220,8 @@ mod tests {
             points.push([a, 1.0, b]);
             points.push([a, 1.5, b + 1.6]);
         }
-        let right = RangeImage::render(&points, [0.0, -2.0, 0.5], 0.04).hidden_share(&points);
-        let wrong = RangeImage::render(&points, [0.0, 1.2, 8.0], 0.04).hidden_share(&points);
+        let (_, right) = RangeImage::render(&points, [0.0, -2.0, 0.5], 0.04);
+        let (_, wrong) = RangeImage::render(&points, [0.0, 8.0, 0.5], 0.04);
         assert!(right < 0.02, "{right}");
         assert!(wrong > right);
     }

@@ -42,8 +42,7 @@ pub fn viewpoint(
     extent: f32,
 ) -> Viewpoint {
     let see = |position: Point| {
-        let image = RangeImage::render(points, position, resolution);
-        let hidden_share = image.hidden_share(points);
+        let (image, hidden_share) = RangeImage::render(points, position, resolution);
         Viewpoint { position, range_image: (hidden_share <= MAX_HIDDEN).then_some(image), hidden_share }
     };
     let first = match sensor {

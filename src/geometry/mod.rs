@@ -9,6 +9,7 @@ pub(crate) mod assert;
 mod nearest_grid;
 mod neighbors;
 mod pose;
+pub mod pose_text;
 mod rigid_fit;
 mod robust;
 mod voxel_grid;

@@ -1,1 +1,12 @@
-//! placeholder
+//! The scan graph: which pairs were tried (retrieval), what they found (edges with several hypotheses each), and how third
+//! scans support or contradict each hypothesis. Uses `pairwise`; used by `mapping`.
+
+mod centrality;
+mod retrieval;
+mod scan_graph;
+mod support;
+
+pub use centrality::harmonic_centrality;
+pub use retrieval::{Retrieval, retrieve};
+pub use scan_graph::{Edge, ScanGraph, Supported, softplus};
+pub use support::{SupportOptions, TRIPLET_FEATURES, triplet_features};

@@ -1,0 +1,214 @@
+//! Scans and the edges between them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::support::{SupportOptions, support};
+use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control, Stage};
+use crate::features::Scan;
+use crate::geometry::Pose;
+use crate::pairwise::{Hypothesis, PairKey, PairResult, match_pair};
+
+/// A hypothesis with what third scans say of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Supported {
+    /// The hypothesis of the pair alone.
+    pub hypothesis: Hypothesis,
+    /// Sum over third scans of the likelihood of the best path that agrees with it.
+    pub support: f64,
+    /// Log-odds that the pose is right, with triplets.
+    pub score: f64,
+}
+
+/// A tried pair.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Edge {
+    /// Which pair.
+    pub pair: PairKey,
+    /// Keypoint numbers (in a, in b) that are mutual nearest neighbours, clearest first.
+    pub matches: Vec<(u16, u16)>,
+    /// Different poses, the best score first.
+    pub hypotheses: Vec<Supported>,
+}
+
+impl Edge {
+    /// The hypotheses as motions from one end to the other: `from` is `a` or `b` of the pair.
+    pub fn motions_from(&self, from: ScanKey) -> impl Iterator<Item = (Pose, &Supported)> {
+        let forward = from == self.pair.b;
+        self.hypotheses.iter().map(move |h| {
+            let a_from_b = h.hypothesis.a_from_b;
+            (if forward { a_from_b } else { a_from_b.inverse() }, h)
+        })
+    }
+
+    /// The best score, or negative infinity without hypotheses.
+    #[must_use]
+    pub fn best_score(&self) -> f64 {
+        self.hypotheses.first().map_or(f64::NEG_INFINITY, |h| h.score)
+    }
+}
+
+/// `ln(1 + e^x)`: what a hypothesis of log-odds x is worth as evidence.
+#[must_use]
+pub fn softplus(x: f64) -> f64 {
+    x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+/// All scans of a project and all pairs tried. Iteration is always in ascending order of keys.
+#[derive(Debug, Clone, Default)]
+pub struct ScanGraph {
+    scans: BTreeMap<ScanKey, Arc<Scan>>,
+    edges: BTreeMap<PairKey, Edge>,
+    neighbors: BTreeMap<ScanKey, BTreeSet<ScanKey>>,
+}
+
+impl ScanGraph {
+    /// An empty graph.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds a scan without edges. A scan that is there already stays.
+    pub fn add_scan(&mut self, scan: Arc<Scan>) {
+        self.scans.entry(scan.key()).or_insert(scan);
+    }
+
+    /// Takes a scan out with all its edges, and takes back the support that it gave. Returns whether it was there.
+    pub fn remove_scan(&mut self, key: ScanKey, options: &SupportOptions) -> bool {
+        if self.scans.remove(&key).is_none() {
+            return false;
+        }
+        let around: Vec<ScanKey> = self.neighbors.remove(&key).into_iter().flatten().collect();
+        for other in &around {
+            self.edges.remove(&PairKey::of(key, *other));
+            if let Some(neighbors) = self.neighbors.get_mut(other) {
+                neighbors.remove(&key);
+            }
+        }
+        self.refresh_support(&self.edges_within(&around), options);
+        true
+    }
+
+    /// All scans.
+    pub fn scans(&self) -> impl ExactSizeIterator<Item = &Arc<Scan>> {
+        self.scans.values()
+    }
+
+    /// One scan.
+    #[must_use]
+    pub fn scan(&self, key: ScanKey) -> Option<&Arc<Scan>> {
+        self.scans.get(&key)
+    }
+
+    /// All edges.
+    pub fn edges(&self) -> impl ExactSizeIterator<Item = &Edge> {
+        self.edges.values()
+    }
+
+    /// The edge of a pair, if it was tried.
+    #[must_use]
+    pub fn edge(&self, x: ScanKey, y: ScanKey) -> Option<&Edge> {
+        self.edges.get(&PairKey::of(x, y))
+    }
+
+    /// Scans that share a tried pair with `key`.
+    pub fn neighbors(&self, key: ScanKey) -> impl Iterator<Item = ScanKey> + '_ {
+        self.neighbors.get(&key).into_iter().flatten().copied()
+    }
+
+    /// Matches and verifies the pairs that were not tried yet, in parallel, adds them as edges and renews the support of every
+    /// hypothesis that they touch. Returns the new results in ascending order. On `Err` the graph is unchanged.
+    pub fn try_pairs(
+        &mut self,
+        pairs: &BTreeSet<PairKey>,
+        options: &SupportOptions,
+        control: Control<'_>,
+    ) -> Result<Vec<PairResult>, Cancelled> {
+        let fresh: Vec<(&Arc<Scan>, &Arc<Scan>)> = pairs
+            .iter()
+            .filter(|pair| !self.edges.contains_key(pair))
+            .filter_map(|pair| Some((self.scans.get(&pair.a)?, self.scans.get(&pair.b)?)))
+            .collect();
+        let done = std::sync::atomic::AtomicUsize::new(0);
+        let results: Vec<PairResult> = fresh
+            .par_iter()
+            .map(|(a, b)| {
+                control.check()?;
+                let result = match_pair(a, b);
+                let finished = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
+                control.report(Stage::Match, finished, fresh.len());
+                Ok(result)
+            })
+            .collect::<Result<_, Cancelled>>()?;
+        self.add_results(results.iter().cloned(), options);
+        Ok(results)
+    }
+
+    /// Adds results of pairs whose scans are both there.
+    pub fn add_results(&mut self, results: impl IntoIterator<Item = PairResult>, options: &SupportOptions) {
+        let mut touched = BTreeSet::new();
+        for result in results {
+            let PairKey { a, b } = result.pair;
+            if !self.scans.contains_key(&a) || !self.scans.contains_key(&b) {
+                continue;
+            }
+            let hypotheses = result
+                .hypotheses
+                .into_iter()
+                .map(|hypothesis| Supported { hypothesis, support: 0.0, score: hypothesis.logit })
+                .collect();
+            self.edges.insert(result.pair, Edge { pair: result.pair, matches: result.matches, hypotheses });
+            self.neighbors.entry(a).or_default().insert(b);
+            self.neighbors.entry(b).or_default().insert(a);
+            touched.insert(result.pair);
+        }
+        // A new edge (a, b) is one side of the triangles (a, b, k): it changes its own support and that of (a, k) and (b, k).
+        let mut stale = touched.clone();
+        for pair in &touched {
+            let common = |k: &ScanKey| {
+                self.edges.contains_key(&PairKey::of(pair.a, *k))
+                    && self.edges.contains_key(&PairKey::of(pair.b, *k))
+            };
+            for k in self.neighbors(pair.a).filter(|k| *k != pair.b).filter(common) {
+                stale.insert(PairKey::of(pair.a, k));
+                stale.insert(PairKey::of(pair.b, k));
+            }
+        }
+        self.refresh_support(&stale.into_iter().collect::<Vec<_>>(), options);
+    }
+
+    fn edges_within(&self, scans: &[ScanKey]) -> Vec<PairKey> {
+        let mut pairs = Vec::new();
+        for (i, x) in scans.iter().enumerate() {
+            for y in &scans[i + 1..] {
+                let pair = PairKey::of(*x, *y);
+                if self.edges.contains_key(&pair) {
+                    pairs.push(pair);
+                }
+            }
+        }
+        pairs
+    }
+
+    fn refresh_support(&mut self, stale: &[PairKey], options: &SupportOptions) {
+        let fresh: Vec<(PairKey, Vec<(f64, f64)>)> = stale
+            .par_iter()
+            .filter_map(|pair| Some((*pair, support(self, self.edges.get(pair)?, options))))
+            .collect();
+        for (pair, values) in fresh {
+            let Some(edge) = self.edges.get_mut(&pair) else { continue };
+            for (hypothesis, (support, score)) in edge.hypotheses.iter_mut().zip(values) {
+                hypothesis.support = support;
+                hypothesis.score = score;
+            }
+            // Equal scores fall back to the pair's own verdict, so that the order never depends on history.
+            edge.hypotheses.sort_by(|x, y| {
+                y.score.total_cmp(&x.score).then(y.hypothesis.logit.total_cmp(&x.hypothesis.logit))
+            });
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! What third scans say: a hypothesis i <- j is supported by every k for which some i <- k <- j leads to the same place.
+
+use super::scan_graph::{Edge, ScanGraph, Supported};
+use crate::geometry::Pose;
+use crate::pairwise::{Logistic, centred_difference, shipped_verifier};
+
+/// Numbers that the second regression takes.
+pub const TRIPLET_FEATURES: usize = 4;
+/// What stands for the log-odds of a rival when there is none.
+const NO_RIVAL: f64 = -12.0;
+
+/// When two motions agree, and when they are rivals. Angles in radians, distances in voxels at the moved scan's centroid.
+#[derive(Debug, Clone)]
+pub struct SupportOptions {
+    /// A path agrees with a hypothesis within this angle …
+    pub agree_angle: f64,
+    /// … and this distance.
+    pub agree_voxels: f64,
+    /// A different pose of the same pair is a rival beyond this angle …
+    pub rival_angle: f64,
+    /// … or this distance.
+    pub rival_voxels: f64,
+    /// Hypotheses less likely than this are no part of a path.
+    pub least_likelihood: f64,
+    /// The regression on the result, by default the shipped one.
+    pub triplet: Logistic,
+}
+
+impl Default for SupportOptions {
+    fn default() -> Self {
+        Self {
+            agree_angle: 8.0_f64.to_radians(),
+            agree_voxels: 4.0,
+            rival_angle: 14.0_f64.to_radians(),
+            rival_voxels: 7.0,
+            least_likelihood: 0.02,
+            triplet: shipped_verifier().triplet.clone(),
+        }
+    }
+}
+
+/// (support, score with triplets) of each hypothesis of an edge, in the edge's order.
+pub(super) fn support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<(f64, f64)> {
+    let supports = path_support(graph, edge, options);
+    (0..edge.hypotheses.len())
+        .map(|h| {
+            let features = features_of(graph, edge, &supports, h, options);
+            (supports[h], options.triplet.logit(&features))
+        })
+        .collect()
+}
+
+/// The features of the second regression for each hypothesis of an edge: the pair's log-odds, log support, and the same of the best
+/// different pose of the pair.
+#[must_use]
+pub fn triplet_features(
+    graph: &ScanGraph,
+    edge: &Edge,
+    options: &SupportOptions,
+) -> Vec<[f64; TRIPLET_FEATURES]> {
+    let supports = path_support(graph, edge, options);
+    (0..edge.hypotheses.len()).map(|h| features_of(graph, edge, &supports, h, options)).collect()
+}
+
+fn features_of(
+    graph: &ScanGraph,
+    edge: &Edge,
+    supports: &[f64],
+    h: usize,
+    options: &SupportOptions,
+) -> [f64; TRIPLET_FEATURES] {
+    let log = |support: f64| (0.01 + support).ln();
+    let me = &edge.hypotheses[h].hypothesis;
+    let mut rival = (NO_RIVAL, log(0.0));
+    if let Some(b) = graph.scan(edge.pair.b) {
+        for (other, support) in edge.hypotheses.iter().zip(supports) {
+            let (angle, distance) = centred_difference(&me.a_from_b, &other.hypothesis.a_from_b, &b.centroid);
+            let differs =
+                angle > options.rival_angle || distance > options.rival_voxels * b.prepared.resolution;
+            if differs {
+                rival = (rival.0.max(other.hypothesis.logit), rival.1.max(log(*support)));
+            }
+        }
+    }
+    [me.logit, log(supports[h]), rival.0, rival.1]
+}
+
+fn likelihood(h: &Supported) -> f64 {
+    1.0 / (1.0 + (-h.hypothesis.logit).exp())
+}
+
+fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<f64> {
+    let (a, b) = (edge.pair.a, edge.pair.b);
+    let mut supports = vec![0.0; edge.hypotheses.len()];
+    let Some(scan_b) = graph.scan(b) else { return supports };
+    let reach = options.agree_voxels * scan_b.prepared.resolution;
+    for k in graph.neighbors(a).filter(|k| *k != b) {
+        let (Some(first), Some(second)) = (graph.edge(a, k), graph.edge(k, b)) else { continue };
+        let legs = |edge: &Edge, from| -> Vec<(Pose, f64)> {
+            edge.motions_from(from)
+                .map(|(motion, h)| (motion, likelihood(h)))
+                .filter(|(_, p)| *p > options.least_likelihood)
+                .collect()
+        };
+        let (a_from_k, k_from_b) = (legs(first, k), legs(second, b));
+        let mut best = vec![0.0_f64; supports.len()];
+        for (a_from_k, p) in &a_from_k {
+            for (k_from_b, q) in &k_from_b {
+                let path = *a_from_k * *k_from_b;
+                let end = path.transform(&scan_b.centroid);
+                for (best, h) in best.iter_mut().zip(&edge.hypotheses) {
+                    let direct = &h.hypothesis.a_from_b;
+                    if p * q > *best
+                        && (direct.transform(&scan_b.centroid) - end).norm() < reach
+                        && (direct.inverse() * path).angle() < options.agree_angle
+                    {
+                        *best = p * q;
+                    }
+                }
+            }
+        }
+        for (total, best) in supports.iter_mut().zip(best) {
+            *total += best;
+        }
+    }
+    supports
+}
