@@ -39,12 +39,15 @@ fn room() -> Vec<Patch> {
     ]
 }
 
+/// A point, its patch and the error of the normal found for it.
+type Sample = (Vector3<f64>, usize, Vector3<f64>);
+
 /// Points that each scan samples for itself on the patches; partners are sought by projection onto the patch.
 struct Samples {
     pairs: Vec<(usize, usize)>,
     truth: Vec<Pose>,
-    /// Points, their patch and the error of the normal found for them, in the frame of their scan.
-    points: Vec<Vec<(Vector3<f64>, usize, Vector3<f64>)>>,
+    /// In the frame of their scan.
+    points: Vec<Vec<Sample>>,
     patches: Vec<Patch>,
 }
 
@@ -79,7 +82,7 @@ impl Correspondences for Samples {
     fn associate(&self, pair: usize, i_from_j: &Pose, gate: f64) -> Vec<Correspondence> {
         let (i, j) = self.pairs[pair];
         let scan_from_model = self.truth[i].inverse();
-        let near = |(point_in_j, patch, error): &(Vector3<f64>, usize, Vector3<f64>)| {
+        let near = |(point_in_j, patch, error): &Sample| {
             let normal = scan_from_model.rotation * self.patches[*patch].normal();
             let on_patch = scan_from_model.transform(&self.patches[*patch].centre);
             let point = i_from_j.transform(point_in_j);
