@@ -1,1 +1,42 @@
-//! placeholder
+//! A ray-casting scan simulator with known truth, for tests, calibration and the demo.
+//!
+//! [`simulate`] draws a furnished [`Building`] from a seed, finds stations in it whose views overlap, and scans it
+//! with a depth camera, a panoramic laser scanner or a spinning `LiDAR`: noise, dropouts, flying pixels, glass,
+//! occlusion, and people who move. Uses [`crate::geometry`], [`crate::cloud`] and [`crate::control`] only; the same
+//! options give the same points at any number of threads.
+//!
+//! ```
+//! use cairn::control::Seed;
+//! use cairn::simulate::{BuildingOptions, Sensor, SurveyOptions, simulate};
+//!
+//! let building = BuildingOptions { rooms: 2, ..BuildingOptions::default() };
+//! let sensor = Sensor::panoramic(5_000);
+//! let survey = simulate(&SurveyOptions { building, sensor, stations: 3, seed: Seed(7), ..Default::default() })?;
+//! let scan = &survey.scans[0];
+//! let in_building = scan.model_from_scan.transform_point(scan.cloud.points[0]);
+//! assert!(in_building[2] > -0.1 && in_building[2] < 3.1, "between floor and ceiling");
+//! # Ok::<(), cairn::simulate::SurveyError>(())
+//! ```
+
+mod acquire;
+mod building;
+mod draw;
+mod furnish;
+mod furniture;
+mod overlap;
+mod people;
+mod plan;
+mod scene;
+mod sensor;
+mod solid;
+mod stations;
+mod survey;
+mod walls;
+
+pub use building::{Building, BuildingError, BuildingOptions};
+pub use plan::{Doorway, Layout, Room, RoomKind};
+pub use scene::Scene;
+pub use sensor::{Noise, Pattern, Sensor, SensorError};
+pub use solid::{Hit, Material, Ray, Shape, Solid};
+pub use stations::StationError;
+pub use survey::{SimulatedScan, Survey, SurveyError, SurveyOptions, simulate};

@@ -1,0 +1,446 @@
+//! Floor plans: rooms in rows, the walls between them, doors that link all rooms, and windows. Used by the building,
+//! which makes solids of them. The plane of a plan is the world's xy plane, in metres.
+
+use super::draw::Draw;
+use crate::control::Seed;
+
+/// How rooms are arranged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Layout {
+    /// Rows of work rooms within a nearly rectangular outline.
+    Office,
+    /// Rows of living rooms of different lengths.
+    House,
+    /// Rooms of different sizes on both sides of a corridor, from which alone most of them are entered.
+    Corridor,
+    /// As [`Layout::Corridor`], but the rooms are exact copies of one another, furniture included.
+    TwinRooms,
+    /// One large hall that is nearly the same after half a turn.
+    Hall,
+}
+
+/// What a room is used for, and so what stands in it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum RoomKind {
+    /// Desks and shelves.
+    Office,
+    /// A long table with chairs.
+    Meeting,
+    /// Sofas and low tables.
+    Living,
+    /// A counter with cupboards, and a table.
+    Kitchen,
+    /// A bed and a wardrobe.
+    Bedroom,
+    /// Racks and cartons.
+    Storage,
+    /// Narrow, with little in it.
+    Passage,
+    /// Large, with pillars.
+    Hall,
+}
+
+/// The inside of a room.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Room {
+    /// Corner with the smallest coordinates.
+    pub low: [f32; 2],
+    /// Corner with the largest coordinates.
+    pub high: [f32; 2],
+    /// From floor to ceiling.
+    pub height: f32,
+    /// What it is used for.
+    pub kind: RoomKind,
+    /// Rooms with the same number are furnished alike.
+    pub identity: u64,
+    /// Whether the room's own axes are the world's after half a turn (its door side is its own -y side).
+    pub turned: bool,
+}
+
+impl Room {
+    /// The middle of the floor.
+    #[must_use]
+    pub fn centre(&self) -> [f32; 2] {
+        [0, 1].map(|k| (self.low[k] + self.high[k]) * 0.5)
+    }
+
+    /// Edge lengths.
+    #[must_use]
+    pub fn size(&self) -> [f32; 2] {
+        [0, 1].map(|k| self.high[k] - self.low[k])
+    }
+}
+
+/// A gap in a wall, from `from` to `to` along it and from `sill` to `head` above the floor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Opening {
+    pub from: f32,
+    pub to: f32,
+    pub sill: f32,
+    pub head: f32,
+    pub kind: OpeningKind,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum OpeningKind {
+    /// An open passage.
+    Passage,
+    /// A door that stands open by an angle (rad), hinged at `from`.
+    Door(f32),
+    /// A window without a pane.
+    Hole,
+    /// A window with a pane.
+    Pane,
+}
+
+/// A straight wall along x (`axis` 0) or y (`axis` 1), between `from` and `to`, around the line `at`.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Wall {
+    pub axis: usize,
+    pub at: f32,
+    pub from: f32,
+    pub to: f32,
+    pub thickness: f32,
+    pub openings: Vec<Opening>,
+}
+
+/// Where one walks from one room into another.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Doorway {
+    /// Indices of the two rooms.
+    pub rooms: [usize; 2],
+    /// Middle of the passage.
+    pub centre: [f32; 2],
+    /// Direction of the wall: 0 along x, 1 along y.
+    pub axis: usize,
+    /// Clear width.
+    pub width: f32,
+}
+
+/// Rooms, walls and doors of one storey.
+#[derive(Debug, Clone)]
+pub(super) struct Plan {
+    pub rooms: Vec<Room>,
+    pub walls: Vec<Wall>,
+    pub doorways: Vec<Doorway>,
+    /// Top of the walls.
+    pub height: f32,
+}
+
+struct Row {
+    start: f32,
+    depth: f32,
+    widths: Vec<f32>,
+    passage: bool,
+}
+
+const OUTER_WALL: f32 = 0.35;
+/// Shortest stretch of wall that two rooms must share to get a door.
+const SHARED_FOR_DOOR: f32 = 1.8;
+
+/// Draws a plan with about `rooms` rooms (corridors not counted) whose edges lie in `size`.
+pub(super) fn draw_plan(layout: Layout, rooms: usize, size: [f32; 2], seed: Seed) -> Plan {
+    let mut draw = Draw::new(seed.derive("simulate.plan", 0));
+    let rows = draw_rows(layout, rooms, size, &mut draw);
+    let mut plan = raise(layout, &rows, &mut draw);
+    cut_doors(layout, &mut plan, &mut draw);
+    cut_windows(layout, &mut plan, seed);
+    plan
+}
+
+fn draw_rows(layout: Layout, rooms: usize, [small, large]: [f32; 2], draw: &mut Draw) -> Vec<Row> {
+    let row = |start, depth, widths| Row { start, depth, widths, passage: false };
+    match layout {
+        Layout::Hall => vec![row(0.0, draw.between(1.8, 2.2) * large, vec![draw.between(2.4, 3.0) * large])],
+        Layout::Corridor | Layout::TwinRooms => {
+            let twin = [draw.between(small, large), draw.between(small, large)];
+            let mut side = |count: usize| {
+                let mut edge =
+                    |twin: f32| if layout == Layout::TwinRooms { twin } else { draw.between(small, large) };
+                let depth = edge(twin[1]);
+                row(0.0, depth, (0..count).map(|_| edge(twin[0])).collect())
+            };
+            let (below, above) = (side(rooms / 2), side(rooms - rooms / 2));
+            let length =
+                [&below, &above].map(|row| row.widths.iter().sum::<f32>() + 0.15 * row.widths.len() as f32);
+            let corridor = vec![length[0].max(length[1])];
+            let corridor = Row { passage: true, ..row(0.0, draw.between(1.9, 2.6), corridor) };
+            [below, corridor, above].into_iter().filter(|row| !row.widths.is_empty()).collect()
+        }
+        Layout::Office | Layout::House => {
+            let count = ((rooms as f32).sqrt().round() as usize).max(1);
+            let mut rows: Vec<Row> = (0..count)
+                .map(|i| {
+                    let in_row = rooms / count + usize::from(i < rooms % count);
+                    let start = if layout == Layout::House { draw.between(0.0, 1.5) } else { 0.0 };
+                    row(
+                        start,
+                        draw.between(small, large),
+                        (0..in_row).map(|_| draw.between(small, large)).collect(),
+                    )
+                })
+                .collect();
+            if layout == Layout::Office {
+                let length = |row: &Row| row.widths.iter().sum::<f32>();
+                let longest = rows.iter().map(length).fold(0.0, f32::max);
+                for row in &mut rows {
+                    let stretch = (longest / length(row)).min(1.3);
+                    row.widths.iter_mut().for_each(|width| *width *= stretch);
+                }
+            }
+            rows
+        }
+    }
+}
+
+/// Lays the rows above each other and puts walls around all rooms.
+fn raise(layout: Layout, rows: &[Row], draw: &mut Draw) -> Plan {
+    let ceiling = if layout == Layout::Hall { draw.between(4.2, 5.0) } else { draw.between(2.6, 3.0) };
+    let mut plan = Plan { rooms: Vec::new(), walls: Vec::new(), doorways: Vec::new(), height: ceiling };
+    let mut y = 0.0;
+    // For each line between rows: middle, thickness, and the stretch that the rows on both sides need.
+    let mut lines = vec![(-OUTER_WALL * 0.5, OUTER_WALL, f32::INFINITY, f32::NEG_INFINITY)];
+    for (r, row) in rows.iter().enumerate() {
+        let mut x = row.start;
+        plan.walls.push(upright(x - OUTER_WALL * 0.5, y, row.depth, OUTER_WALL));
+        for (i, width) in row.widths.iter().enumerate() {
+            let twin = layout == Layout::TwinRooms && !row.passage;
+            plan.rooms.push(Room {
+                low: [x, y],
+                high: [x + width, y + row.depth],
+                height: if twin || layout == Layout::Hall {
+                    ceiling
+                } else {
+                    ceiling - draw.between(0.0, 0.3)
+                },
+                kind: room_kind(layout, row.passage, plan.rooms.len()),
+                identity: if twin { u64::MAX } else { plan.rooms.len() as u64 },
+                turned: r == 0 && rows.get(1).is_some_and(|next| next.passage),
+            });
+            let gap = if i + 1 == row.widths.len() { OUTER_WALL } else { draw.between(0.1, 0.22) };
+            plan.walls.push(upright(x + width + gap * 0.5, y, row.depth, gap));
+            x += width + gap;
+        }
+        y += row.depth;
+        let inner = if layout == Layout::TwinRooms { 0.2 } else { draw.between(0.12, 0.28) };
+        let thickness = if r + 1 == rows.len() { OUTER_WALL } else { inner };
+        lines.push((y + thickness * 0.5, thickness, f32::INFINITY, f32::NEG_INFINITY));
+        for line in &mut lines[r..] {
+            *line = (line.0, line.1, line.2.min(row.start - OUTER_WALL), line.3.max(x));
+        }
+        y += thickness;
+    }
+    plan.walls.extend(lines.into_iter().map(|(at, thickness, from, to)| Wall {
+        axis: 0,
+        at,
+        from,
+        to,
+        thickness,
+        openings: Vec::new(),
+    }));
+    plan
+}
+
+fn upright(at: f32, y: f32, depth: f32, thickness: f32) -> Wall {
+    Wall { axis: 1, at, from: y, to: y + depth, thickness, openings: Vec::new() }
+}
+
+fn room_kind(layout: Layout, passage: bool, index: usize) -> RoomKind {
+    use RoomKind::{Bedroom, Hall, Kitchen, Living, Meeting, Office, Passage, Storage};
+    if passage {
+        return Passage;
+    }
+    let kinds = match layout {
+        Layout::Hall => return Hall,
+        Layout::TwinRooms => return Office,
+        Layout::House => [Living, Kitchen, Bedroom, Office, Bedroom, Storage],
+        Layout::Office | Layout::Corridor => [Office, Meeting, Office, Kitchen, Living, Storage],
+    };
+    kinds[index % kinds.len()]
+}
+
+/// Cuts doors so that every room can be reached from every other one, and some more.
+fn cut_doors(layout: Layout, plan: &mut Plan, draw: &mut Draw) {
+    let mut pairs: Vec<Shared> = (0..plan.rooms.len())
+        .flat_map(|a| (a + 1..plan.rooms.len()).map(move |b| (a, b)))
+        .filter_map(|(a, b)| Shared::of(plan, a, b))
+        .filter(|pair| layout != Layout::TwinRooms || pair.from_passage(plan))
+        .collect();
+    draw.shuffle(&mut pairs);
+    // Doors to the corridor come first, so that they make the tree.
+    pairs.sort_by_key(|pair| !pair.from_passage(plan));
+    let mut group: Vec<usize> = (0..plan.rooms.len()).collect();
+    for pair in pairs {
+        let [a, b] = pair.rooms;
+        let joins = group[a] != group[b];
+        if !joins && !draw.chance(0.3) {
+            continue;
+        }
+        let (old, new) = (group[b], group[a]);
+        group.iter_mut().filter(|g| **g == old).for_each(|g| *g = new);
+        cut_door(layout, plan, &pair, draw);
+    }
+}
+
+/// The stretch of wall between two rooms.
+struct Shared {
+    rooms: [usize; 2],
+    wall: usize,
+    from: f32,
+    to: f32,
+}
+
+impl Shared {
+    fn of(plan: &Plan, a: usize, b: usize) -> Option<Self> {
+        let (room_a, room_b) = (&plan.rooms[a], &plan.rooms[b]);
+        plan.walls.iter().enumerate().find_map(|(index, wall)| {
+            let (along, across) = (wall.axis, 1 - wall.axis);
+            let touches = |high: f32, low: f32| {
+                (high - (wall.at - wall.thickness * 0.5)).abs() < 1e-3
+                    && (low - (wall.at + wall.thickness * 0.5)).abs() < 1e-3
+            };
+            let between = touches(room_a.high[across], room_b.low[across])
+                || touches(room_b.high[across], room_a.low[across]);
+            let from = room_a.low[along].max(room_b.low[along]).max(wall.from);
+            let to = room_a.high[along].min(room_b.high[along]).min(wall.to);
+            (between && to - from > SHARED_FOR_DOOR).then_some(Self { rooms: [a, b], wall: index, from, to })
+        })
+    }
+
+    fn from_passage(&self, plan: &Plan) -> bool {
+        self.rooms.iter().any(|&room| plan.rooms[room].kind == RoomKind::Passage)
+    }
+}
+
+fn cut_door(layout: Layout, plan: &mut Plan, shared: &Shared, draw: &mut Draw) {
+    let (mut width, mut head, mut kind) = (draw.between(0.85, 1.05), 2.05, OpeningKind::Passage);
+    if draw.chance(0.5) {
+        kind = OpeningKind::Door(draw.between(1.2, 1.9));
+    } else if draw.chance(0.5) {
+        (width, head) = (draw.between(1.1, 1.2), draw.between(2.1, 2.3));
+    }
+    let mut middle = draw.between(shared.from + 0.85, shared.to - 0.85);
+    if layout == Layout::TwinRooms {
+        // The same place in each copy: the middle of its own front.
+        (width, head, kind) = (0.95, 2.05, OpeningKind::Passage);
+        middle = (shared.from + shared.to) * 0.5;
+    }
+    let wall = &mut plan.walls[shared.wall];
+    wall.openings.push(Opening {
+        from: middle - width * 0.5,
+        to: middle + width * 0.5,
+        sill: 0.0,
+        head,
+        kind,
+    });
+    let centre = if wall.axis == 0 { [middle, wall.at] } else { [wall.at, middle] };
+    plan.doorways.push(Doorway { rooms: shared.rooms, centre, axis: wall.axis, width });
+}
+
+/// Cuts windows into outer walls. Copies of a room get the same ones.
+fn cut_windows(layout: Layout, plan: &mut Plan, seed: Seed) {
+    for r in 0..plan.rooms.len() {
+        let room = plan.rooms[r].clone();
+        for own_side in 0..4 {
+            // Only their back is an outer wall of every copy.
+            if layout == Layout::TwinRooms && room.kind != RoomKind::Passage && own_side != 2 {
+                continue;
+            }
+            let side = if room.turned { (own_side + 2) % 4 } else { own_side };
+            let purpose = (u128::from(room.identity) << 8) | own_side as u128;
+            let mut draw = Draw::new(seed.derive("simulate.windows", purpose));
+            let axis = side % 2;
+            let length = room.size()[axis];
+            let most = if room.kind == RoomKind::Passage { 1 } else { ((length / 2.2) as usize).min(5) };
+            for i in 0..most {
+                let slot = length / most as f32;
+                let width = draw.between(0.7, (slot - 0.5).min(2.4));
+                let own =
+                    (i as f32 + 0.5) * slot - length * 0.5 + draw.between(-0.5, 0.5) * (slot - width - 0.4);
+                let middle = room.centre()[axis] + if room.turned { -own } else { own };
+                let kind = if draw.chance(0.75) { OpeningKind::Pane } else { OpeningKind::Hole };
+                let (sill, head) = (draw.between(0.75, 1.05), draw.between(1.9, room.height - 0.25));
+                let (from, to) = (middle - width * 0.5, middle + width * 0.5);
+                if draw.chance(0.55) && width > 0.6 {
+                    let opening = Opening { from, to, sill, head, kind };
+                    cut_window(plan, &room, side, opening);
+                }
+            }
+        }
+    }
+}
+
+/// Cuts a window if nothing but the outside is behind it.
+fn cut_window(plan: &mut Plan, room: &Room, side: usize, opening: Opening) {
+    let (along, across) = (side % 2, 1 - side % 2);
+    let outwards = if side == 1 || side == 2 { room.high[across] } else { room.low[across] };
+    let beyond = outwards + if side == 1 || side == 2 { 0.6 } else { -0.6 };
+    let inside_another = plan.rooms.iter().any(|other| {
+        other.low[across] < beyond
+            && other.high[across] > beyond
+            && other.low[along] - 0.5 < opening.to
+            && other.high[along] + 0.5 > opening.from
+    });
+    if inside_another {
+        return;
+    }
+    let wall = plan.walls.iter_mut().find(|wall| {
+        wall.axis == along
+            && ((wall.at - outwards).abs() - wall.thickness * 0.5).abs() < 1e-3
+            && wall.from < opening.from
+            && wall.to > opening.to
+    });
+    if let Some(wall) = wall {
+        wall.openings.push(opening);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LAYOUTS: [Layout; 5] =
+        [Layout::Office, Layout::House, Layout::Corridor, Layout::TwinRooms, Layout::Hall];
+
+    #[test]
+    fn every_room_can_be_reached_through_doors() {
+        for layout in LAYOUTS {
+            for seed in 0..20 {
+                let plan = draw_plan(layout, 1 + seed as usize % 8, [4.0, 7.0], Seed(seed));
+                let mut reached = vec![false; plan.rooms.len()];
+                reached[0] = true;
+                for _ in 0..plan.rooms.len() {
+                    for doorway in &plan.doorways {
+                        let [a, b] = doorway.rooms;
+                        let either = reached[a] || reached[b];
+                        (reached[a], reached[b]) = (either, either);
+                    }
+                }
+                assert!(reached.iter().all(|&r| r), "{layout:?}, seed {seed}: {reached:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn rooms_do_not_overlap_and_openings_of_a_wall_do_not_touch() {
+        for layout in LAYOUTS {
+            for seed in 0..20 {
+                let plan = draw_plan(layout, 6, [4.0, 7.0], Seed(seed));
+                for (i, a) in plan.rooms.iter().enumerate() {
+                    for b in &plan.rooms[i + 1..] {
+                        assert!((0..2).any(|k| a.high[k] < b.low[k] || b.high[k] < a.low[k]));
+                    }
+                }
+                for wall in &plan.walls {
+                    for (i, a) in wall.openings.iter().enumerate() {
+                        assert!(a.from < a.to && a.sill < a.head && a.head < plan.height);
+                        assert!(
+                            wall.openings[i + 1..].iter().all(|b| a.to < b.from || b.to < a.from),
+                            "{wall:?}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,329 @@
+//! A whole survey: a building, stations in it, and one scan from each, with the truth. The only entry point that most
+//! users of the simulator need.
+
+use std::collections::BTreeSet;
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::acquire::acquire;
+use super::building::{Building, BuildingError, BuildingOptions};
+use super::draw::Draw;
+use super::overlap::Neighbourhood;
+use super::people::people_around;
+use super::scene::Scene;
+use super::sensor::{Sensor, SensorError};
+use super::stations::{StationError, choose_stations};
+use crate::cloud::PointCloud;
+use crate::control::Seed;
+use crate::geometry::Pose;
+
+/// What to simulate.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurveyOptions {
+    /// The building.
+    pub building: BuildingOptions,
+    /// The sensor at every station.
+    pub sensor: Sensor,
+    /// Number of scans.
+    pub stations: usize,
+    /// Least share of its view that a station has in common with an earlier one, 0.02 to 0.9.
+    pub least_overlap: f32,
+    /// People around the sensor, elsewhere in every scan.
+    pub people: usize,
+    /// Rigs that share the work; each scans its own part of the building.
+    pub rigs: usize,
+    /// Everything random follows from it.
+    pub seed: Seed,
+}
+
+impl Default for SurveyOptions {
+    fn default() -> Self {
+        Self {
+            building: BuildingOptions::default(),
+            sensor: Sensor::panoramic(36_000),
+            stations: 24,
+            least_overlap: 0.3,
+            people: 0,
+            rigs: 1,
+            seed: Seed(0),
+        }
+    }
+}
+
+/// Why a survey cannot be simulated.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum SurveyError {
+    /// See [`BuildingError`].
+    #[error(transparent)]
+    Building(#[from] BuildingError),
+    /// See [`SensorError`].
+    #[error(transparent)]
+    Sensor(#[from] SensorError),
+    /// See [`StationError`].
+    #[error(transparent)]
+    Stations(#[from] StationError),
+    /// Nobody to carry the sensor.
+    #[error("a survey needs at least one rig")]
+    NoRig,
+}
+
+impl SurveyOptions {
+    /// What the demo shows: an office of six furnished rooms, two rigs, 24 scans by a panoramic scanner.
+    #[must_use]
+    pub fn demo(seed: Seed) -> Self {
+        Self { rigs: 2, seed, ..Self::default() }
+    }
+
+    /// Checks every value that can be checked without building anything.
+    pub fn validate(&self) -> Result<(), SurveyError> {
+        self.building.validate()?;
+        self.sensor.validate()?;
+        if self.stations == 0 {
+            return Err(StationError::None.into());
+        }
+        if self.rigs == 0 {
+            return Err(SurveyError::NoRig);
+        }
+        Ok(())
+    }
+}
+
+/// One scan and the truth about it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimulatedScan {
+    /// Says nothing about where or when the scan was taken.
+    pub name: String,
+    /// In the sensor's frame, with the sensor at the origin.
+    pub cloud: PointCloud,
+    /// The true pose of the sensor; the model frame is the building's.
+    pub model_from_scan: Pose,
+    /// Which rig took it, from 0.
+    pub rig: usize,
+}
+
+/// A simulated survey.
+#[derive(Debug, Clone)]
+pub struct Survey {
+    /// The building that was scanned.
+    pub building: Building,
+    /// The scans, sorted by their meaningless names.
+    pub scans: Vec<SimulatedScan>,
+}
+
+/// Simulates a survey: the same for the same options, at any number of threads of the ambient rayon pool.
+pub fn simulate(options: &SurveyOptions) -> Result<Survey, SurveyError> {
+    options.validate()?;
+    let seed = options.seed;
+    let building = Building::new(&options.building, seed)?;
+    let poses = choose_stations(&building, &options.sensor, options.stations, options.least_overlap, seed)?;
+    let rigs = assign_rigs(&building, &poses, options.rigs);
+    let names = draw_names(poses.len(), &mut Draw::new(seed.derive("simulate.names", 0)));
+    let mut scans: Vec<SimulatedScan> = poses
+        .into_par_iter()
+        .zip(rigs)
+        .zip(names)
+        .enumerate()
+        .map(|(station, ((model_from_scan, rig), name))| {
+            let mut draw = Draw::new(seed.derive("simulate.people", station as u128));
+            let eye: Vector3<f32> = model_from_scan.translation.cast();
+            let people: Scene = people_around(&building, &eye, options.people, &mut draw);
+            let scenes = [&building.scene, &people];
+            let cloud = acquire(&scenes, &options.sensor, &model_from_scan, seed, station as u64);
+            SimulatedScan { name, cloud, model_from_scan, rig }
+        })
+        .collect();
+    scans.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(Survey { building, scans })
+}
+
+/// Cuts the stations into equal parts along the longer side of the building.
+fn assign_rigs(building: &Building, poses: &[Pose], rigs: usize) -> Vec<usize> {
+    let (low, high) = building.scene.bounds();
+    let axis = usize::from(high.y - low.y > high.x - low.x);
+    let mut order: Vec<usize> = (0..poses.len()).collect();
+    order.sort_by(|a, b| poses[*a].translation[axis].total_cmp(&poses[*b].translation[axis]));
+    let mut rig_of = vec![0; poses.len()];
+    for (rank, station) in order.into_iter().enumerate() {
+        rig_of[station] = rank * rigs / poses.len();
+    }
+    rig_of
+}
+
+fn draw_names(count: usize, draw: &mut Draw) -> Vec<String> {
+    let mut names = BTreeSet::new();
+    while names.len() < count {
+        names.insert(format!("scan-{:06x}", draw.count(0, 0xff_ffff)));
+    }
+    let mut names: Vec<String> = names.into_iter().collect();
+    draw.shuffle(&mut names);
+    names
+}
+
+impl Survey {
+    /// Share of the points of scan `of` that lie within `tolerance` metres of a point of scan `with` under the truth.
+    ///
+    /// The tolerance should exceed the spacing of the points. `None` if there is no such scan.
+    #[must_use]
+    pub fn overlap(&self, of: usize, with: usize, tolerance: f32) -> Option<f64> {
+        let (of, with) = (self.scans.get(of)?, self.scans.get(with)?);
+        let index = Neighbourhood::new(&with.cloud, &with.model_from_scan, tolerance);
+        Some(index.share_of(&of.cloud, &of.model_from_scan))
+    }
+
+    /// [`Survey::overlap`] of all pairs: row `of`, column `with`.
+    #[must_use]
+    pub fn overlaps(&self, tolerance: f32) -> Vec<Vec<f64>> {
+        let columns: Vec<Vec<f64>> = self
+            .scans
+            .par_iter()
+            .map(|with| {
+                let index = Neighbourhood::new(&with.cloud, &with.model_from_scan, tolerance);
+                self.scans.iter().map(|of| index.share_of(&of.cloud, &of.model_from_scan)).collect()
+            })
+            .collect();
+        (0..self.scans.len()).map(|of| columns.iter().map(|column| column[of]).collect()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulate::plan::Layout;
+
+    fn small(layout: Layout, sensor: Sensor, stations: usize) -> SurveyOptions {
+        let building = BuildingOptions { layout, rooms: 4, ..BuildingOptions::default() };
+        SurveyOptions { building, sensor, stations, seed: Seed(9), ..SurveyOptions::default() }
+    }
+
+    /// Whether links of at least `least` overlap in either direction join all scans.
+    fn is_connected(overlaps: &[Vec<f64>], least: f64) -> bool {
+        let mut reached = vec![false; overlaps.len()];
+        let mut open = vec![0];
+        while let Some(i) = open.pop() {
+            if !std::mem::replace(&mut reached[i], true) {
+                open.extend((0..overlaps.len()).filter(|&j| overlaps[i][j].max(overlaps[j][i]) >= least));
+            }
+        }
+        reached.iter().all(|&r| r)
+    }
+
+    /// From a point to the plane through the points of a flat neighbourhood.
+    fn distance_to_plane(index: &Neighbourhood, point: Vector3<f32>) -> Option<f32> {
+        let near: Vec<_> = index.around(&point).collect();
+        let mean = near.iter().copied().sum::<Vector3<f32>>() / near.len().max(1) as f32;
+        let spread =
+            near.iter().map(|p| *p - mean).map(|d| d * d.transpose()).sum::<nalgebra::Matrix3<f32>>();
+        let eigen = (spread / near.len().max(1) as f32).symmetric_eigen();
+        let least = eigen.eigenvalues.imin();
+        let flat = near.len() >= 8 && eigen.eigenvalues[least] < 0.006f32.powi(2);
+        flat.then(|| (point - mean).dot(&eigen.eigenvectors.column(least)).abs())
+    }
+
+    #[test]
+    fn the_truth_maps_scans_onto_each_other_at_noise_level() {
+        let survey = simulate(&small(Layout::Office, Sensor::panoramic(60_000), 6)).unwrap();
+        let overlaps = survey.overlaps(0.1);
+        let mut pairs = 0;
+        for (i, of) in survey.scans.iter().enumerate() {
+            for (j, with) in survey.scans.iter().enumerate() {
+                if i == j || overlaps[i][j] < 0.6 {
+                    continue;
+                }
+                let index = Neighbourhood::new(&with.cloud, &with.model_from_scan, 0.1);
+                let mut distances: Vec<f32> = of
+                    .cloud
+                    .points
+                    .iter()
+                    .step_by(7)
+                    .filter_map(|p| distance_to_plane(&index, of.model_from_scan.transform_point(*p).into()))
+                    .collect();
+                distances.sort_by(f32::total_cmp);
+                let median = distances[distances.len() / 2];
+                // 0.67 sigma is the median of a normal error; the plane errs, too.
+                assert!(median < 1.2 * Sensor::panoramic(1).noise.sigma(4.0), "median {median} m");
+                pairs += 1;
+            }
+        }
+        assert!(pairs > 2, "only {pairs} pairs overlap");
+    }
+
+    #[test]
+    fn a_survey_is_the_same_at_one_and_two_threads() {
+        let mut options = small(Layout::House, Sensor::panoramic(4000), 5);
+        options.people = 2;
+        let run = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| simulate(&options)).unwrap().scans
+        };
+        let (one, two) = (run(1), run(2));
+        assert_eq!(one, two);
+        options.seed = Seed(10);
+        assert_ne!(one, simulate(&options).unwrap().scans);
+    }
+
+    #[test]
+    fn the_scans_of_every_layout_and_sensor_hang_together() {
+        for (layout, sensor, stations) in [
+            (Layout::Office, Sensor::panoramic(20_000), 12),
+            (Layout::House, Sensor::panoramic(20_000), 12),
+            (Layout::Corridor, Sensor::panoramic(20_000), 12),
+            (Layout::TwinRooms, Sensor::spinning_lidar(64), 10),
+            (Layout::Hall, Sensor::spinning_lidar(64), 6),
+            (Layout::House, Sensor::depth_camera(160, 120), 30),
+        ] {
+            let survey = simulate(&small(layout, sensor, stations)).unwrap();
+            assert_eq!(survey.scans.len(), stations);
+            assert!(is_connected(&survey.overlaps(0.15), 0.2), "{layout:?} falls apart");
+            for scan in &survey.scans {
+                assert!(scan.cloud.len() > 3000, "{layout:?}: {} points", scan.cloud.len());
+                let nearest =
+                    scan.cloud.points.iter().map(|[x, y, z]| x.hypot(*y).hypot(*z)).fold(9.0, f32::min);
+                assert!(nearest > 0.2, "{layout:?}: a point {nearest} m from the sensor");
+            }
+        }
+    }
+
+    #[test]
+    fn names_are_unique_and_say_nothing_about_the_order() {
+        let names = draw_names(400, &mut Draw::new(Seed(1).derive("test", 0)));
+        let unique: BTreeSet<_> = names.iter().collect();
+        assert_eq!(unique.len(), names.len());
+        let rising = names.windows(2).filter(|pair| pair[0] < pair[1]).count();
+        assert!((150..250).contains(&rising), "{rising} of 399 rise");
+    }
+
+    #[test]
+    fn rigs_share_the_scans_evenly_and_each_has_its_part_of_the_building() {
+        let mut options = small(Layout::Office, Sensor::panoramic(2000), 9);
+        options.rigs = 2;
+        let survey = simulate(&options).unwrap();
+        let of_rig = |rig| survey.scans.iter().filter(move |scan| scan.rig == rig);
+        assert_eq!((of_rig(0).count(), of_rig(1).count()), (5, 4));
+        let (low, high) = survey.building.scene.bounds();
+        let axis = usize::from(high.y - low.y > high.x - low.x);
+        let end = of_rig(0).map(|scan| scan.model_from_scan.translation[axis]).fold(f64::MIN, f64::max);
+        assert!(of_rig(1).all(|scan| scan.model_from_scan.translation[axis] >= end));
+    }
+
+    #[test]
+    fn people_are_in_one_scan_and_gone_in_another() {
+        let mut options = small(Layout::Hall, Sensor::panoramic(8000), 3);
+        let empty = simulate(&options).unwrap();
+        options.people = 4;
+        let busy = simulate(&options).unwrap();
+        for (without, with) in empty.scans.iter().zip(&busy.scans) {
+            assert_eq!(without.model_from_scan, with.model_from_scan);
+            assert_ne!(without.cloud, with.cloud);
+        }
+    }
+
+    #[test]
+    fn a_survey_without_rigs_or_stations_is_refused() {
+        let usual = SurveyOptions::default();
+        let no_rig = SurveyOptions { rigs: 0, ..usual.clone() };
+        assert_eq!(simulate(&no_rig).map(|_| ()), Err(SurveyError::NoRig));
+        let no_station = SurveyOptions { stations: 0, ..usual };
+        assert_eq!(simulate(&no_station).map(|_| ()), Err(SurveyError::Stations(StationError::None)));
+    }
+}
