@@ -60,7 +60,7 @@ impl NearestGrid {
         let mut brick_index = 0_usize;
         let mut inner = 0_usize;
         for k in 0..3 {
-            let offset = (point[k] * inverse).floor() as i64 - self.low[k];
+            let offset = ((point[k] * inverse).floor() as i64).saturating_sub(self.low[k]);
             if offset < 0 || offset >= self.bricks[k] * BRICK {
                 return None;
             }

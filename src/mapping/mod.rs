@@ -1,7 +1,27 @@
-//! The incremental mapper: from verified edges to a model that grows one join at a time.
+//! The incremental mapper: from verified edges to a model that grows one join at a time. Uses `graph` and `optimize`; the
+//! service and the command line see only [`LiveModel`] and [`ModelSnapshot`].
+//!
+//! Beside the paper: the scan graph is `graph`; `initial_pair` starts a component; `next_scan` ranks what comes next;
+//! `candidates` clusters the poses that the neighbours propose; `join` pools the cluster's matches, fits and verifies; `tracks`
+//! continue, are created and merge, with closed-form and robust aggregation; `refine` is local and global bundle adjustment, pose graph
+//! and joint dense adjustment; `track_refinement` moves keypoints; `mapper` has one method a step and `policy` their order.
 
+mod candidates;
+mod component;
+mod initial_pair;
+mod join;
 mod live_model;
+mod mapper;
+mod next_scan;
+mod options;
+mod policy;
+mod refine;
 mod snapshot;
+mod surfaces;
+mod track_refinement;
+mod tracks;
 
-pub use live_model::{LiveModel, MappingOptions, RefinementReport, RestoreError};
-pub use snapshot::{ComponentSummary, ModelSnapshot, RegisteredScan, ScanOutcome, WaitingReason};
+pub use live_model::{LiveModel, RefinementReport, RestoreError};
+pub use options::{JoinLevel, MappingOptions};
+pub use snapshot::{ComponentSnapshot, ModelSnapshot, RegisteredScan, ScanOutcome, WaitingReason};
+pub use tracks::{Landmark, TrackObservation, Tracks, aggregate, aggregate_robustly};

@@ -2,14 +2,16 @@
 
 use std::collections::BTreeMap;
 
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
+use super::component::Component;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 
 /// Why a scan is in no component.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "reason", rename_all = "kebab-case")]
+#[serde(rename_all = "kebab-case")]
 pub enum WaitingReason {
     /// No other scan is there yet.
     OnlyScan,
@@ -40,7 +42,7 @@ pub enum WaitingReason {
 
 /// Where a scan stands in a model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "status", rename_all = "kebab-case")]
+#[serde(rename_all = "kebab-case")]
 pub enum ScanOutcome {
     /// In a component.
     Registered(RegisteredScan),
@@ -65,7 +67,7 @@ pub struct RegisteredScan {
 
 /// One rigid piece of the model. Frames of different components are unrelated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ComponentSummary {
+pub struct ComponentSnapshot {
     /// Member scans, ascending by key.
     pub scans: Vec<ScanKey>,
     /// The scan at identity.
@@ -76,6 +78,35 @@ pub struct ComponentSummary {
     pub observations: usize,
     /// Root mean square distance between observations and landmarks, metres.
     pub landmark_rms: f64,
+    /// Poses and tracks, to go on from.
+    pub(super) component: Component,
+}
+
+impl ComponentSnapshot {
+    pub(super) fn of(component: &Component) -> Self {
+        let mut square = 0.0;
+        for landmark in component.tracks.iter() {
+            for o in &landmark.observations {
+                if let Some(pose) = component.poses.get(&o.scan) {
+                    square += (pose.transform(&o.point_in_scan) - landmark.position).norm_squared();
+                }
+            }
+        }
+        let observations = component.tracks.observations();
+        Self {
+            scans: component.poses.keys().copied().collect(),
+            gauge: component.gauge,
+            landmarks: component.tracks.len(),
+            observations,
+            landmark_rms: (square / observations.max(1) as f64).sqrt(),
+            component: component.clone(),
+        }
+    }
+
+    /// The landmarks' positions in the component's frame, metres.
+    pub fn landmark_positions(&self) -> impl Iterator<Item = Vector3<f64>> + '_ {
+        self.component.tracks.iter().map(|landmark| landmark.position)
+    }
 }
 
 /// An immutable state of the model.
@@ -84,20 +115,19 @@ pub struct ModelSnapshot {
     /// Voxel size v, metres; 0 for an empty model.
     pub resolution: f64,
     /// Largest first.
-    pub components: Vec<ComponentSummary>,
+    pub components: Vec<ComponentSnapshot>,
     /// Every scan of the model.
     pub scans: BTreeMap<ScanKey, ScanOutcome>,
 }
 
 impl ModelSnapshot {
     /// As bytes for a blob.
-    #[must_use]
-    pub fn to_bytes(&self) -> Vec<u8> {
-        serde_json::to_vec(self).unwrap_or_default()
+    pub fn to_bytes(&self) -> Result<Vec<u8>, postcard::Error> {
+        postcard::to_stdvec(self)
     }
 
     /// From the bytes of [`ModelSnapshot::to_bytes`].
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, serde_json::Error> {
-        serde_json::from_slice(bytes)
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, postcard::Error> {
+        postcard::from_bytes(bytes)
     }
 }

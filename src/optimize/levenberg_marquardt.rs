@@ -123,6 +123,27 @@ pub enum Termination {
     NothingFree,
 }
 
+impl std::fmt::Display for Termination {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Gradient { measured, threshold } => {
+                write!(f, "the gradient promises {measured:.1e} of the energy (limit {threshold:.1e})")
+            }
+            Self::Step { measured, threshold } => {
+                write!(f, "the last step was {measured:.1e} (limit {threshold:.1e})")
+            }
+            Self::RelativeCost { measured, threshold } => {
+                write!(f, "the energy fell by a share of {measured:.1e} (limit {threshold:.1e})")
+            }
+            Self::MaxIterations { iterations } => write!(f, "all {iterations} iterations are used up"),
+            Self::NoProgress { measured, threshold } => {
+                write!(f, "no step lowers the energy: damping reached {measured:.1e} (limit {threshold:.1e})")
+            }
+            Self::NothingFree => write!(f, "nothing is free to move"),
+        }
+    }
+}
+
 /// What a minimisation did.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Report {

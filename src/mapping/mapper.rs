@@ -1,0 +1,399 @@
+//! The engine of incremental mapping: one method a step of the method, no opinion on their order (that is `policy`).
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::candidates::{Candidate, best_candidate, support_of};
+use super::component::Component;
+use super::initial_pair::initial_pairs;
+use super::join::{Refusal, check_support, verify_join};
+use super::next_scan::visible_landmarks;
+use super::options::{JoinLevel, MappingOptions};
+use super::refine::{dense, local_bundle_adjustment, neighborhood, pose_graph};
+use super::snapshot::WaitingReason;
+use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
+use crate::geometry::Pose;
+use crate::graph::{Retrieval, ScanGraph};
+use crate::pairwise::PairKey;
+
+/// A waiting scan that could be registered.
+struct NextScan {
+    component: usize,
+    scan: ScanKey,
+    candidate: Candidate,
+    /// Spread of the landmarks that it sees, then their number.
+    visible: (usize, usize),
+}
+
+/// The state of mapping: components, and scans that wait.
+#[derive(Debug, Clone, Default)]
+pub struct Mapper {
+    /// Pieces of at least two scans.
+    pub components: Vec<Component>,
+    /// Scans in no component, and why as far as known.
+    pub waiting: BTreeMap<ScanKey, Option<Refusal>>,
+    /// Joins that were refused on sight of the surfaces, with the support and the level they had: not worth another look until the
+    /// support changes.
+    refused: BTreeMap<(ScanKey, ScanKey), (f64, f64)>,
+    /// How often each scan was filtered out, so that filtering ends.
+    filtered: BTreeMap<ScanKey, usize>,
+    joins_since_refinement: usize,
+}
+
+/// A scan is filtered at most this often while the model does not forget.
+const MAX_FILTERED: usize = 2;
+/// A scan is filtered only from components of at least this many scans.
+const FILTER_FROM: usize = 4;
+/// … and only if another place has this much more support than the one it has.
+const FILTER_MARGIN: f64 = 2.0;
+
+impl Mapper {
+    /// Number of registered scans.
+    #[must_use]
+    pub fn registered(&self) -> usize {
+        self.components.iter().map(Component::len).sum()
+    }
+
+    /// Takes in a scan that waits.
+    pub fn add_waiting(&mut self, scan: ScanKey) {
+        self.waiting.insert(scan, None);
+    }
+
+    /// Takes a scan out of the model. A component left with one scan dissolves and that scan waits.
+    pub fn remove(&mut self, scan: ScanKey, options: &MappingOptions) {
+        self.waiting.remove(&scan);
+        self.filtered.remove(&scan);
+        self.refused.retain(|(x, y), _| *x != scan && *y != scan);
+        for component in &mut self.components {
+            component.remove(scan, options);
+        }
+        self.dissolve_small();
+    }
+
+    /// Next-scan registration: the first of the ranked waiting scans whose join passes the level. Returns the scan.
+    pub fn register_next_scan(
+        &mut self,
+        graph: &ScanGraph,
+        level: &JoinLevel,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<Option<ScanKey>, Cancelled> {
+        for next in self.rank_next_scans(graph, level, voxel, options) {
+            control.check()?;
+            let component = &self.components[next.component];
+            let single = Component::single(next.scan);
+            let link = (component.gauge, next.scan);
+            if self.already_refused(link, next.candidate.support, level) {
+                continue;
+            }
+            match verify_join(graph, component, &single, &next.candidate, level, voxel, options) {
+                Ok(model_from_scan) => {
+                    self.waiting.remove(&next.scan);
+                    let component = &mut self.components[next.component];
+                    component.absorb(single, &model_from_scan, graph, options);
+                    local_bundle_adjustment(component, next.scan, voxel, options, control)?;
+                    let free = neighborhood(component, next.scan, options);
+                    dense(graph, component, Some(&free), voxel, control)?;
+                    self.joins_since_refinement += 1;
+                    return Ok(Some(next.scan));
+                }
+                Err(refusal) => {
+                    self.refused.insert(link, (next.candidate.support, level.support));
+                    self.waiting.insert(next.scan, Some(refusal));
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Waiting scans that pass a level's support against some component; those that see most landmarks first.
+    fn rank_next_scans(
+        &mut self,
+        graph: &ScanGraph,
+        level: &JoinLevel,
+        voxel: f64,
+        options: &MappingOptions,
+    ) -> Vec<NextScan> {
+        let mut ranked = Vec::new();
+        let waiting: Vec<ScanKey> = self.waiting.keys().copied().collect();
+        for scan in waiting {
+            let single = Component::single(scan);
+            for (index, component) in self.components.iter().enumerate() {
+                let Some(candidate) = best_candidate(graph, component, &single, voxel, options) else {
+                    continue;
+                };
+                match check_support(&candidate, level, options) {
+                    Ok(()) => {
+                        let visible = visible_landmarks(graph, component, scan, &candidate);
+                        let visible = (visible.score, visible.keypoints.len());
+                        ranked.push(NextScan { component: index, scan, candidate, visible });
+                    }
+                    Err(refusal) => {
+                        self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
+                    }
+                }
+            }
+        }
+        ranked.sort_by(|x, y| {
+            y.visible
+                .cmp(&x.visible)
+                .then(y.candidate.support.total_cmp(&x.candidate.support))
+                .then(x.scan.cmp(&y.scan))
+                .then(x.component.cmp(&y.component))
+        });
+        ranked
+    }
+
+    /// Initial pair: starts a component from two waiting scans. Returns whether one was started.
+    pub fn start_component(
+        &mut self,
+        graph: &ScanGraph,
+        level: &JoinLevel,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<bool, Cancelled> {
+        let free: BTreeSet<ScanKey> = self.waiting.keys().copied().collect();
+        for (first, second) in initial_pairs(graph, &free, level, options) {
+            control.check()?;
+            let (mut a, b) = (Component::single(first), Component::single(second));
+            let Some(candidate) = best_candidate(graph, &a, &b, voxel, options) else { continue };
+            let link = (first.min(second), first.max(second));
+            if self.already_refused(link, candidate.support, level) {
+                continue;
+            }
+            let verdict = check_support(&candidate, level, options)
+                .and_then(|()| verify_join(graph, &a, &b, &candidate, level, voxel, options));
+            match verdict {
+                Ok(a_from_b) => {
+                    a.absorb(b, &a_from_b, graph, options);
+                    self.waiting.remove(&first);
+                    self.waiting.remove(&second);
+                    self.components.push(a);
+                    self.joins_since_refinement += 1;
+                    return Ok(true);
+                }
+                Err(refusal) => {
+                    self.refused.insert(link, (candidate.support, level.support));
+                    for scan in [first, second] {
+                        self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
+                    }
+                }
+            }
+        }
+        Ok(false)
+    }
+
+    /// Merges the two components whose join is best supported. Returns whether two were merged.
+    pub fn merge_components(
+        &mut self,
+        graph: &ScanGraph,
+        level: &JoinLevel,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<bool, Cancelled> {
+        let mut ranked: Vec<(f64, usize, usize, Candidate)> = Vec::new();
+        for i in 0..self.components.len() {
+            for j in i + 1..self.components.len() {
+                let (a, b) = self.larger_first(i, j);
+                let Some(candidate) =
+                    best_candidate(graph, &self.components[a], &self.components[b], voxel, options)
+                else {
+                    continue;
+                };
+                if check_support(&candidate, level, options).is_ok() {
+                    ranked.push((candidate.margin(options), a, b, candidate));
+                }
+            }
+        }
+        ranked.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+        for (_, a, b, candidate) in ranked {
+            control.check()?;
+            let link = (self.components[a].gauge, self.components[b].gauge);
+            if self.already_refused(link, candidate.support, level) {
+                continue;
+            }
+            match verify_join(
+                graph,
+                &self.components[a],
+                &self.components[b],
+                &candidate,
+                level,
+                voxel,
+                options,
+            ) {
+                Ok(a_from_b) => {
+                    let other = self.components[b].clone();
+                    self.components[a].absorb(other, &a_from_b, graph, options);
+                    self.components.remove(b);
+                    self.joins_since_refinement += 1;
+                    return Ok(true);
+                }
+                Err(_) => {
+                    self.refused.insert(link, (candidate.support, level.support));
+                }
+            }
+        }
+        Ok(false)
+    }
+
+    /// Filtering: takes out scans that have clearly more support at another pose than at their own. They wait, and may register
+    /// again. Returns how many.
+    pub fn filter_scans(&mut self, graph: &ScanGraph, voxel: f64, options: &MappingOptions) -> usize {
+        let mut misplaced: Vec<ScanKey> = Vec::new();
+        for component in self.components.iter().filter(|c| c.len() >= FILTER_FROM) {
+            for (scan, pose) in &component.poses {
+                if self.filtered.get(scan).copied().unwrap_or(0) >= MAX_FILTERED {
+                    continue;
+                }
+                let single = Component::single(*scan);
+                let mut rest = component.clone();
+                rest.poses.remove(scan);
+                let Some(best) = best_candidate(graph, &rest, &single, voxel, options) else { continue };
+                let own = support_of(graph, &rest, &single, pose, voxel, options);
+                if best.support > own + FILTER_MARGIN
+                    && differs(&best.a_from_b, pose, *scan, graph, voxel, options)
+                {
+                    misplaced.push(*scan);
+                }
+            }
+        }
+        for scan in &misplaced {
+            *self.filtered.entry(*scan).or_default() += 1;
+            for component in &mut self.components {
+                component.remove(*scan, options);
+            }
+            self.add_waiting(*scan);
+        }
+        self.dissolve_small();
+        misplaced.len()
+    }
+
+    /// Pairs worth a try for scans and components that stay apart: for every scan outside the largest component, its most similar
+    /// scans elsewhere that were not tried yet.
+    #[must_use]
+    pub fn widen(&self, graph: &ScanGraph, options: &MappingOptions) -> BTreeSet<PairKey> {
+        let largest =
+            (0..self.components.len()).max_by_key(|i| (self.components[*i].len(), std::cmp::Reverse(*i)));
+        let home = |scan: &ScanKey| self.components.iter().position(|c| c.poses.contains_key(scan));
+        let retrieval = Retrieval::new(graph);
+        let mut pairs = BTreeSet::new();
+        for scan in graph.scans().map(|s| s.key()) {
+            let own = home(&scan);
+            if own.is_some() && own == largest {
+                continue;
+            }
+            let fresh =
+                retrieval.ranked(scan).into_iter().map(|(other, _)| other).filter(|other| {
+                    (own.is_none() || home(other) != own) && graph.edge(scan, *other).is_none()
+                });
+            pairs.extend(fresh.take(options.retrieved).map(|other| PairKey::of(scan, other)));
+        }
+        pairs
+    }
+
+    /// Refines every component that grew: pose graph, then joint dense adjustment, then tracks at the new poses.
+    pub fn refine(
+        &mut self,
+        graph: &ScanGraph,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<(), Cancelled> {
+        for component in &mut self.components {
+            pose_graph(graph, component, voxel, options, control)?;
+            dense(graph, component, None, voxel, control)?;
+            component.tracks.filter(&component.poses, options.track_voxels * voxel, options.track_length);
+        }
+        self.joins_since_refinement = 0;
+        Ok(())
+    }
+
+    /// Whether the model has grown enough since the last refinement to deserve another.
+    #[must_use]
+    pub fn refinement_is_due(&self, options: &MappingOptions) -> bool {
+        let grown = (self.registered() as f64 * options.refine_growth) as usize;
+        self.joins_since_refinement >= options.refine_joins.max(grown)
+    }
+
+    /// Whether anything was joined since the last refinement.
+    #[must_use]
+    pub fn joined_since_refinement(&self) -> bool {
+        self.joins_since_refinement > 0
+    }
+
+    /// Largest components first, ties by gauge.
+    pub fn sort_components(&mut self) {
+        self.components.sort_by(|x, y| y.len().cmp(&x.len()).then(x.gauge.cmp(&y.gauge)));
+    }
+
+    /// Why a scan waits, in words for its owner.
+    #[must_use]
+    pub fn waiting_reason(
+        &self,
+        scan: ScanKey,
+        graph: &ScanGraph,
+        options: &MappingOptions,
+    ) -> WaitingReason {
+        let needed = options.levels.last().map_or(0.0, |l| l.support);
+        let tried = graph.neighbors(scan).count();
+        if graph.scans().len() < 2 {
+            return WaitingReason::OnlyScan;
+        }
+        match self.waiting.get(&scan).copied().flatten() {
+            Some(Refusal::Rival { support, rival }) => {
+                WaitingReason::Ambiguous { best_support: support, rival_support: rival }
+            }
+            Some(Refusal::Violation { found, allowed }) => {
+                WaitingReason::ViolatesFreeSpace { violation: found, allowed }
+            }
+            Some(Refusal::Support { found, .. }) => {
+                WaitingReason::NoVerifiedPair { tried, best_support: found, needed }
+            }
+            None => WaitingReason::NoVerifiedPair { tried, best_support: 0.0, needed },
+        }
+    }
+
+    fn larger_first(&self, i: usize, j: usize) -> (usize, usize) {
+        if self.components[j].len() > self.components[i].len() { (j, i) } else { (i, j) }
+    }
+
+    fn already_refused(&self, link: (ScanKey, ScanKey), support: f64, level: &JoinLevel) -> bool {
+        self.refused
+            .get(&link)
+            .is_some_and(|(then, at)| (support - then).abs() < 0.05 * then.abs() && level.support >= *at)
+    }
+
+    fn dissolve_small(&mut self) {
+        let (kept, small): (Vec<Component>, Vec<Component>) =
+            std::mem::take(&mut self.components).into_iter().partition(|c| c.len() >= 2);
+        self.components = kept;
+        for scan in small.into_iter().flat_map(|c| c.poses.into_keys()) {
+            self.add_waiting(scan);
+        }
+    }
+}
+
+/// The refusal that says more: a violation or a rival over mere lack of support, and more support over less.
+fn worse(known: Option<Refusal>, new: Refusal) -> Option<Refusal> {
+    match (known, new) {
+        (Some(Refusal::Support { found, .. }), Refusal::Support { found: now, .. }) if now < found => known,
+        (Some(Refusal::Violation { .. } | Refusal::Rival { .. }), Refusal::Support { .. }) => known,
+        _ => Some(new),
+    }
+}
+
+fn differs(
+    x: &Pose,
+    y: &Pose,
+    scan: ScanKey,
+    graph: &ScanGraph,
+    voxel: f64,
+    options: &MappingOptions,
+) -> bool {
+    let Some(scan) = graph.scan(scan) else { return false };
+    let (angle, distance) = crate::pairwise::centred_difference(x, y, &scan.centroid);
+    angle > options.rival_angle || distance > options.rival_voxels * voxel
+}

@@ -1,0 +1,78 @@
+//! Settings of the mapper. Lengths are in voxels of the prepared scans, angles in radians, supports in log-odds summed over
+//! agreeing edges.
+
+use serde::{Deserialize, Serialize};
+
+use crate::control::Seed;
+
+/// What a join must show. Tried from the strictest down; after every join the strictest comes first again.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct JoinLevel {
+    /// Least support, after half of the runner-up's is taken off.
+    pub support: f64,
+    /// Largest share of violations of free space among the points that can be judged.
+    pub violation: f64,
+    /// Fewest agreeing matches of an initial pair.
+    pub initial_matches: usize,
+}
+
+/// Settings of the mapper.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct MappingOptions {
+    /// Root of the random choices.
+    pub seed: Seed,
+    /// Pairs retrieved for each scan.
+    pub retrieved: usize,
+    /// Rounds of widening for scans and components that stay apart, each trying as many pairs again.
+    pub widening_rounds: usize,
+    /// From strict to lenient. Below the last, scans wait.
+    pub levels: Vec<JoinLevel>,
+    /// Share of the runner-up's support taken off a candidate's.
+    pub rival_share: f64,
+    /// Candidate poses agree within this angle …
+    pub cluster_angle: f64,
+    /// … and this distance at the moved scan's centroid.
+    pub cluster_voxels: f64,
+    /// Candidate poses are rivals beyond this angle …
+    pub rival_angle: f64,
+    /// … or this distance.
+    pub rival_voxels: f64,
+    /// Largest distance between an observation and its landmark.
+    pub track_voxels: f64,
+    /// Observations of a landmark, at least.
+    pub track_length: usize,
+    /// Most covisible neighbours that move with a new scan in local bundle adjustment.
+    pub local_neighbors: usize,
+    /// The model is refined when it has grown by this share …
+    pub refine_growth: f64,
+    /// … and by at least this many joins.
+    pub refine_joins: usize,
+}
+
+impl Default for MappingOptions {
+    fn default() -> Self {
+        let level = |support, violation, initial_matches| JoinLevel { support, violation, initial_matches };
+        Self {
+            seed: Seed(0),
+            retrieved: 20,
+            widening_rounds: 6,
+            levels: vec![
+                level(8.0, 0.08, 100),
+                level(4.0, 0.1, 50),
+                level(2.5, 0.15, 25),
+                level(1.5, 0.2, 12),
+            ],
+            rival_share: 0.5,
+            cluster_angle: 9.0_f64.to_radians(),
+            cluster_voxels: 5.0,
+            rival_angle: 14.0_f64.to_radians(),
+            rival_voxels: 7.0,
+            track_voxels: 2.0,
+            track_length: 2,
+            local_neighbors: 5,
+            refine_growth: 0.1,
+            refine_joins: 4,
+        }
+    }
+}

@@ -1,0 +1,73 @@
+//! The order of mapping: which step comes when, what is tried again, and when the model is refined.
+//!
+//! At each level of strictness, strictest first: register the next scan into a component; else merge two components; else start
+//! a component from an initial pair. Any success goes back to the strictest level, because the model has grown and what waited may
+//! now be well supported. When nothing fits at any level, misplaced scans are filtered and tried again, and retrieval widens
+//! for what stays apart. What is left then waits.
+
+use std::collections::BTreeSet;
+
+use super::mapper::Mapper;
+use super::options::MappingOptions;
+use crate::control::{Cancelled, Control, Stage};
+use crate::graph::{ScanGraph, SupportOptions};
+use crate::pairwise::PairResult;
+
+/// Grows the model until nothing more fits. `pairs` collects the results of pairs that widening tried.
+pub fn grow(
+    mapper: &mut Mapper,
+    graph: &mut ScanGraph,
+    voxel: f64,
+    options: &MappingOptions,
+    pairs: &mut Vec<PairResult>,
+    control: Control<'_>,
+) -> Result<(), Cancelled> {
+    let support = SupportOptions::default();
+    let mut rounds = 0;
+    loop {
+        join_all(mapper, graph, voxel, options, control)?;
+        if mapper.filter_scans(graph, voxel, options) > 0 {
+            continue;
+        }
+        let fresh: BTreeSet<_> =
+            if rounds < options.widening_rounds { mapper.widen(graph, options) } else { BTreeSet::new() };
+        if fresh.is_empty() {
+            break;
+        }
+        rounds += 1;
+        pairs.extend(graph.try_pairs(&fresh, &support, control)?);
+    }
+    if mapper.refinement_is_due(options) {
+        mapper.refine(graph, voxel, options, control)?;
+    }
+    mapper.sort_components();
+    Ok(())
+}
+
+/// Makes joins, strictest level first, until no level makes any.
+fn join_all(
+    mapper: &mut Mapper,
+    graph: &ScanGraph,
+    voxel: f64,
+    options: &MappingOptions,
+    control: Control<'_>,
+) -> Result<(), Cancelled> {
+    let total = mapper.registered() + mapper.waiting.len();
+    let mut level = 0;
+    while let Some(rules) = options.levels.get(level) {
+        control.check()?;
+        let joined = mapper.register_next_scan(graph, rules, voxel, options, control)?.is_some()
+            || mapper.merge_components(graph, rules, voxel, options, control)?
+            || mapper.start_component(graph, rules, voxel, options, control)?;
+        if joined {
+            level = 0;
+            control.report(Stage::Map, mapper.registered(), total);
+            if mapper.refinement_is_due(options) {
+                mapper.refine(graph, voxel, options, control)?;
+            }
+        } else {
+            level += 1;
+        }
+    }
+    Ok(())
+}
