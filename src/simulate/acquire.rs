@@ -147,7 +147,7 @@ mod tests {
 
     /// A wall 2.5 m to 3 m in front of a camera that stands at the origin and looks along z.
     fn wall() -> Scene {
-        Scene::new(vec![Solid::between(Vector3::new(-9.0, -9.0, 2.5), Vector3::new(9.0, 9.0, 3.0))])
+        Scene::new(&[Solid::between(Vector3::new(-9.0, -9.0, 2.5), Vector3::new(9.0, 9.0, 3.0))])
     }
 
     fn scan(scene: &Scene, sensor: &Sensor) -> PointCloud {
@@ -186,7 +186,7 @@ mod tests {
         solids.push(box_in_front);
         let mut camera = Sensor::depth_camera(160, 120);
         camera.noise = Noise { base: 0.0, growth: 0.0, dropout: 0.0, mixed: 0.5 };
-        let cloud = scan(&Scene::new(solids), &camera);
+        let cloud = scan(&Scene::new(&solids), &camera);
         let flying = cloud.points.iter().filter(|[_, _, z]| *z > 1.45 && *z < 2.45);
         let mut count = 0;
         for [x, y, z] in flying {
@@ -203,7 +203,7 @@ mod tests {
         solids.push(
             Solid::between(Vector3::new(-9.0, -9.0, 1.0), Vector3::new(9.0, 9.0, 1.01)).of(Material::Glass),
         );
-        let cloud = scan(&Scene::new(solids), &Sensor::depth_camera(160, 120));
+        let cloud = scan(&Scene::new(&solids), &Sensor::depth_camera(160, 120));
         let behind = cloud.points.iter().filter(|[_, _, z]| *z > 2.0).count() as f32 / cloud.len() as f32;
         assert!((0.7..0.97).contains(&behind), "{behind}");
     }

@@ -86,7 +86,7 @@ impl Building {
             solids.extend(room_solids);
             footprints.extend(room_footprints);
         }
-        Ok(Self { scene: Scene::new(solids), rooms: plan.rooms, doorways: plan.doorways, footprints })
+        Ok(Self { scene: Scene::new(&solids), rooms: plan.rooms, doorways: plan.doorways, footprints })
     }
 
     /// Whether a place is inside a room or a doorway and at least `clearance` metres away from every surface.

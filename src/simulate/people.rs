@@ -32,7 +32,7 @@ pub(super) fn people_around(
             solids.extend(person(draw).iter().map(|solid| solid.moved(&rotation, &translation)));
         }
     }
-    Scene::new(solids)
+    Scene::new(&solids)
 }
 
 /// Someone at the origin who faces -y.

@@ -195,7 +195,7 @@ fn draw_rows(layout: Layout, rooms: usize, [small, large]: [f32; 2], draw: &mut 
 
 /// Lays the rows above each other and puts walls around all rooms.
 fn raise(layout: Layout, rows: &[Row], draw: &mut Draw) -> Plan {
-    let ceiling = if layout == Layout::Hall { draw.between(4.2, 5.0) } else { draw.between(2.6, 3.0) };
+    let ceiling = if layout == Layout::Hall { draw.between(4.2, 5.0) } else { draw.between(2.7, 3.1) };
     let mut plan = Plan { rooms: Vec::new(), walls: Vec::new(), doorways: Vec::new(), height: ceiling };
     let mut y = 0.0;
     // For each line between rows: middle, thickness, and the stretch that the rows on both sides need.
@@ -211,7 +211,7 @@ fn raise(layout: Layout, rows: &[Row], draw: &mut Draw) -> Plan {
                 height: if twin || layout == Layout::Hall {
                     ceiling
                 } else {
-                    ceiling - draw.between(0.0, 0.3)
+                    ceiling - draw.between(0.0, 0.25)
                 },
                 kind: room_kind(layout, row.passage, plan.rooms.len()),
                 identity: if twin { u64::MAX } else { plan.rooms.len() as u64 },
@@ -264,11 +264,11 @@ fn cut_doors(layout: Layout, plan: &mut Plan, draw: &mut Draw) {
     let mut pairs: Vec<Shared> = (0..plan.rooms.len())
         .flat_map(|a| (a + 1..plan.rooms.len()).map(move |b| (a, b)))
         .filter_map(|(a, b)| Shared::of(plan, a, b))
-        .filter(|pair| layout != Layout::TwinRooms || pair.from_passage(plan))
+        .filter(|pair| layout != Layout::TwinRooms || pair.touches_passage(plan))
         .collect();
     draw.shuffle(&mut pairs);
     // Doors to the corridor come first, so that they make the tree.
-    pairs.sort_by_key(|pair| !pair.from_passage(plan));
+    pairs.sort_by_key(|pair| !pair.touches_passage(plan));
     let mut group: Vec<usize> = (0..plan.rooms.len()).collect();
     for pair in pairs {
         let [a, b] = pair.rooms;
@@ -307,17 +307,17 @@ impl Shared {
         })
     }
 
-    fn from_passage(&self, plan: &Plan) -> bool {
+    fn touches_passage(&self, plan: &Plan) -> bool {
         self.rooms.iter().any(|&room| plan.rooms[room].kind == RoomKind::Passage)
     }
 }
 
 fn cut_door(layout: Layout, plan: &mut Plan, shared: &Shared, draw: &mut Draw) {
     let (mut width, mut head, mut kind) = (draw.between(0.85, 1.05), 2.05, OpeningKind::Passage);
-    if draw.chance(0.5) {
-        kind = OpeningKind::Door(draw.between(1.2, 1.9));
-    } else if draw.chance(0.5) {
-        (width, head) = (draw.between(1.1, 1.2), draw.between(2.1, 2.3));
+    match draw.count(0, 3) {
+        0 | 1 => kind = OpeningKind::Door(draw.between(1.5, 1.95)),
+        2 => (width, head) = (draw.between(1.1, 1.2), draw.between(2.1, 2.3)),
+        _ => {}
     }
     let mut middle = draw.between(shared.from + 0.85, shared.to - 0.85);
     if layout == Layout::TwinRooms {

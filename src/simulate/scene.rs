@@ -32,7 +32,7 @@ const STACK_SIZE: usize = 64;
 impl Scene {
     /// Sorts the solids. n log^2 n.
     #[must_use]
-    pub fn new(solids: Vec<Solid>) -> Self {
+    pub fn new(solids: &[Solid]) -> Self {
         let mut items: Vec<Item> = solids.iter().enumerate().map(Item::new).collect();
         let mut nodes = Vec::with_capacity(2 * items.len());
         if !items.is_empty() {
@@ -223,7 +223,7 @@ mod tests {
     fn the_hierarchy_finds_the_same_hit_as_trying_every_solid() {
         let mut draw = Draw::new(Seed(11).derive("test", 0));
         let solids: Vec<Solid> = (0..300).map(|_| random_solid(&mut draw)).collect();
-        let scene = Scene::new(solids.clone());
+        let scene = Scene::new(&solids);
         let mut hits = 0;
         for _ in 0..2000 {
             let ray = Ray {
@@ -245,6 +245,6 @@ mod tests {
     fn an_empty_scene_is_never_met() {
         let ray = Ray { origin: Vector3::zeros(), direction: Vector3::x() };
         assert_eq!(Scene::default().cast(&ray, 0.0, 9.0), None);
-        assert_eq!(Scene::new(Vec::new()).bounds(), (Vector3::zeros(), Vector3::zeros()));
+        assert_eq!(Scene::new(&[]).bounds(), (Vector3::zeros(), Vector3::zeros()));
     }
 }

@@ -241,22 +241,22 @@ fn meet_ball(
 fn meet_triangle(
     origin: &Vector3<f32>,
     direction: &Vector3<f32>,
-    [a, b, c]: &[Vector3<f32>; 3],
+    [first, second, third]: &[Vector3<f32>; 3],
     within: impl Fn(f32) -> bool,
 ) -> Met {
-    let (edge_b, edge_c) = (b - a, c - a);
-    let across = direction.cross(&edge_c);
-    let determinant = edge_b.dot(&across);
+    let (edge, other_edge) = (second - first, third - first);
+    let across = direction.cross(&other_edge);
+    let determinant = edge.dot(&across);
     if determinant.abs() < 1e-12 {
         return None;
     }
-    let from_a = origin - a;
-    let u = from_a.dot(&across) / determinant;
-    let along = from_a.cross(&edge_b);
+    let from_first = origin - first;
+    let u = from_first.dot(&across) / determinant;
+    let along = from_first.cross(&edge);
     let v = direction.dot(&along) / determinant;
-    let distance = edge_c.dot(&along) / determinant;
+    let distance = other_edge.dot(&along) / determinant;
     let inside = u >= 0.0 && v >= 0.0 && u + v <= 1.0 && within(distance);
-    inside.then(|| (distance, edge_b.cross(&edge_c).normalize()))
+    inside.then(|| (distance, edge.cross(&other_edge).normalize()))
 }
 
 #[cfg(test)]

@@ -77,15 +77,27 @@ pub(super) fn choose_stations(
         let poses = draw_candidates(building, sensor, count << attempt, seed);
         let candidates = look_around(building, sensor, poses);
         let chosen = choose(&candidates, count, overlap, &mut Draw::new(seed.derive("simulate.choose", 0)));
-        if chosen.len() == count {
-            return Ok(chosen.into_iter().map(|c| candidates[c].world_from_sensor).collect());
-        }
         placed = placed.max(chosen.len());
+        let poses: Vec<Pose> = chosen.into_iter().map(|c| candidates[c].world_from_sensor).collect();
+        // A few stations cannot be everywhere; enough of them should.
+        let missed = count >= 2 * building.rooms.len() && misses_a_room(building, &poses);
+        if poses.len() == count && (!missed || attempt + 1 == ATTEMPTS) {
+            return Ok(poses);
+        }
     }
     Err(StationError::NotConnected { placed, wanted: count, overlap })
 }
 
-/// Poses in all doorways, and in rooms in proportion to their area, several times as many as are wanted.
+/// Whether a room has no station inside.
+fn misses_a_room(building: &Building, poses: &[Pose]) -> bool {
+    building.rooms.iter().any(|room| {
+        !poses
+            .iter()
+            .any(|pose| (0..2).all(|k| (room.low[k]..room.high[k]).contains(&(pose.translation[k] as f32))))
+    })
+}
+
+/// Poses in and around all doorways, and in rooms in proportion to their area, several times as many as are wanted.
 fn draw_candidates(building: &Building, sensor: &Sensor, count: usize, seed: Seed) -> Vec<Pose> {
     let mut draw = Draw::new(seed.derive("simulate.stations", count as u128));
     let headings = if sensor.looks_ahead() { 4 } else { 1 };
@@ -93,8 +105,11 @@ fn draw_candidates(building: &Building, sensor: &Sensor, count: usize, seed: See
     let whole: f32 = building.rooms.iter().map(area).sum();
     let mut poses = Vec::new();
     for doorway in &building.doorways {
-        for _ in 0..2 * headings {
-            let [x, y] = doorway.centre.map(|c| c + draw.between(-0.06, 0.06));
+        for _ in 0..8 * headings {
+            let mut at = doorway.centre.map(|c| c + draw.between(-0.06, 0.06));
+            // In the passage, or a step before or behind it: together these link the two rooms.
+            at[1 - doorway.axis] += draw.pick([-1.1, -0.7, 0.0, 0.0, 0.7, 1.1]);
+            let [x, y] = at;
             let place = Vector3::new(x, y, eye_height(&mut draw));
             if building.is_clear(&place, DOORWAY_CLEARANCE) {
                 poses.push(mounted(sensor, place, &mut draw));

@@ -285,6 +285,26 @@ mod tests {
     }
 
     #[test]
+    fn two_stations_a_room_leave_no_room_out() {
+        for seed in 0..12 {
+            let options = SurveyOptions {
+                seed: Seed(seed),
+                sensor: Sensor::panoramic(3000),
+                ..SurveyOptions::demo(Seed(0))
+            };
+            let survey = simulate(&options).unwrap();
+            for room in &survey.building.rooms {
+                let inside = |scan: &SimulatedScan| {
+                    (0..2).all(|k| {
+                        (room.low[k]..room.high[k]).contains(&(scan.model_from_scan.translation[k] as f32))
+                    })
+                };
+                assert!(survey.scans.iter().any(inside), "seed {seed}: nobody stood in {room:?}");
+            }
+        }
+    }
+
+    #[test]
     fn names_are_unique_and_say_nothing_about_the_order() {
         let names = draw_names(400, &mut Draw::new(Seed(1).derive("test", 0)));
         let unique: BTreeSet<_> = names.iter().collect();

@@ -14,8 +14,9 @@ fn frustum(piece: &mut Piece, [x, y]: [f32; 2], bottom: (f32, f32), top: (f32, f
         Vector3::new(x + radius * cos, y + radius * sin, z)
     };
     for i in 0..SIDES {
-        let [a, b, c, d] = [corner(bottom, i), corner(bottom, i + 1), corner(top, i), corner(top, i + 1)];
-        for corners in [[a, b, c], [b, d, c]] {
+        let (near, far) = (corner(bottom, i), corner(top, i + 1));
+        for between in [corner(bottom, i + 1), corner(top, i)] {
+            let corners = [near, between, far];
             piece.push(Solid::new(Shape::Triangle(corners), Vector3::zeros()));
         }
     }
@@ -178,7 +179,7 @@ pub(in crate::simulate) fn ceiling_lamp(draw: &mut Draw) -> Piece {
             piece.rod([-0.6, 0.0, -0.1], [0.6, 0.0, -0.1], 0.02);
         }
         1 => {
-            let drop = draw.between(0.3, 0.7);
+            let drop = draw.between(0.25, 0.5);
             piece.rod([0.0, 0.0, 0.0], [0.0, 0.0, -drop], 0.01);
             frustum(&mut piece, [0.0; 2], (draw.between(0.18, 0.35), -drop - 0.15), (0.06, -drop + 0.05));
         }
