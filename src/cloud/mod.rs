@@ -4,8 +4,10 @@ mod decode;
 mod encode;
 mod normals;
 mod point_cloud;
+mod preview;
 
 pub use decode::{DecodeError, DecodeOptions, Decoded, Format, decode, metres_per_unit, sniff};
 pub use encode::PlyWriter;
 pub use normals::{face, normals};
 pub use point_cloud::{PointCloud, ScanKey};
+pub use preview::{Image, ImageError, PartColor, PreviewOptions, PreviewPart, render, scan_color};
