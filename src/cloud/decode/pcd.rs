@@ -1,4 +1,4 @@
-//! PCD: ascii, binary, binary_compressed.
+//! PCD: ascii, binary, `binary_compressed`.
 //!
 //! `pcd-rs` reads the header, from bytes that are bounded here; it allocates the declared sizes of a compressed payload
 //! and overflows on large counts, so the payload is read here.

@@ -1,7 +1,7 @@
 //! XYZ and PTS: a point a line, in the spellings that programs and locales have.
 //!
 //! Values are separated by whitespace, commas or semicolons, as the first row shows. Where commas do not separate, they are
-//! decimal marks. A first line (or a comment right before the rows, as CloudCompare writes) may name the columns;
+//! decimal marks. A first line (or a comment right before the rows, as `CloudCompare` writes) may name the columns;
 //! otherwise they are `x y z`, then `r g b` (6 columns) or `intensity r g b` (7 columns) where those are whole numbers up to
 //! 255. PTS begins with the number of its points, and may hold several such blocks.
 
