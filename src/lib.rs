@@ -23,4 +23,15 @@ pub mod mapping;
 pub mod evaluate;
 pub mod simulate;
 
+pub mod project;
+
+pub mod storage;
+
+pub mod jobs;
+
+pub mod http;
+
+pub mod app;
 pub mod cli;
+pub mod config;
+pub mod telemetry;

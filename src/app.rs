@@ -1,0 +1,111 @@
+//! The whole service in a process: wiring, start and shutdown. The command line, the demo and the tests all run
+//! exactly this.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use crate::config::Config;
+use crate::http::{Api, openapi_yaml, router};
+use crate::jobs::{Compute, Exports, Intake, Workers};
+use crate::storage::{StorageError, Store};
+
+/// Why the service does not start.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// The data directory cannot be used.
+    #[error("the data directory {0}: {1}")]
+    Data(std::path::PathBuf, StorageError),
+    /// The thread pool does not start.
+    #[error("the thread pool: {0}")]
+    Threads(#[from] rayon::ThreadPoolBuildError),
+    /// The address cannot be listened on.
+    #[error("cannot listen on {0}: {1}")]
+    Listen(SocketAddr, std::io::Error),
+    /// The interface's description cannot be written.
+    #[error("the description of the interface: {0}")]
+    Description(String),
+}
+
+/// A service that runs.
+#[derive(Debug)]
+pub struct Running {
+    /// Where it listens.
+    pub addr: SocketAddr,
+    stop: CancellationToken,
+    server: JoinHandle<()>,
+}
+
+impl Running {
+    /// Begins to stop when cancelled.
+    #[must_use]
+    pub fn stopper(&self) -> CancellationToken {
+        self.stop.clone()
+    }
+
+    /// Where it can be reached from this machine.
+    #[must_use]
+    pub fn url(&self) -> String {
+        format!("http://{}", self.addr)
+    }
+
+    /// Waits until the service has stopped by itself or by its stopper.
+    pub async fn wait(self) {
+        if let Err(error) = self.server.await {
+            tracing::error!(%error, "the service ended badly");
+        }
+    }
+
+    /// Stops the service: no new requests, running answers end, jobs are given back; returns when all is closed.
+    pub async fn stop(self) {
+        self.stop.cancel();
+        self.wait().await;
+    }
+}
+
+/// How long running answers, such as downloads, are waited for at a shutdown.
+const DRAIN: std::time::Duration = std::time::Duration::from_secs(10);
+
+/// Starts the service. When this returns, it answers.
+pub async fn start(config: Config) -> Result<Running, StartError> {
+    let store =
+        Store::open(&config.data).await.map_err(|error| StartError::Data(config.data.clone(), error))?;
+    let compute = Compute::new(config.threads)?;
+    let listener =
+        TcpListener::bind(config.listen).await.map_err(|error| StartError::Listen(config.listen, error))?;
+    let addr = listener.local_addr().map_err(|error| StartError::Listen(config.listen, error))?;
+    let stop = CancellationToken::new();
+    let api = Api {
+        store: store.clone(),
+        intake: Intake::new(store.clone(), config.max_upload_bytes, config.upload_idle),
+        exports: Exports::new(store.clone(), compute.clone(), config.workers.max_points),
+        stop: stop.clone(),
+        openapi: Arc::from(openapi_yaml().map_err(|problem| StartError::Description(problem.detail))?),
+    };
+    let workers = Workers::start(store.clone(), compute, config.workers)
+        .await
+        .map_err(|error| StartError::Data(config.data.clone(), error))?;
+    tracing::info!(%addr, data = %config.data.display(), "listening");
+    let server = tokio::spawn(serve(listener, api, workers, store, stop.clone()));
+    Ok(Running { addr, stop, server })
+}
+
+async fn serve(listener: TcpListener, api: Api, workers: Workers, store: Store, stop: CancellationToken) {
+    let app = router(api);
+    let graceful = axum::serve(listener, app).with_graceful_shutdown(stop.clone().cancelled_owned());
+    let overdue = async {
+        stop.cancelled().await;
+        tokio::time::sleep(DRAIN).await;
+    };
+    tokio::select! {
+        ended = graceful => if let Err(error) = ended { tracing::error!(%error, "the listener failed") },
+        () = overdue => tracing::warn!("answers that did not end in time are cut off"),
+    }
+    stop.cancel();
+    workers.stop().await;
+    store.close().await;
+    tracing::info!("stopped");
+}

@@ -1,0 +1,56 @@
+//! `cairn serve`: the service, until it is told to stop.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use tokio_util::sync::CancellationToken;
+
+use crate::config::Settings;
+use crate::{app, telemetry};
+
+/// Run the service
+#[derive(Debug, Clone, Args)]
+pub struct ServeArgs {
+    /// TOML file with settings; flags and environment win over it
+    #[arg(long, env = "CAIRN_CONFIG", value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// The settings.
+    #[command(flatten)]
+    pub settings: Settings,
+}
+
+/// Serves until SIGINT or SIGTERM, then shuts down softly; a second signal ends the process at once.
+pub fn run(args: ServeArgs) -> anyhow::Result<()> {
+    let file = args.config.as_deref().map(Settings::from_file).transpose()?.unwrap_or_default();
+    let config = args.settings.or(file).resolve()?;
+    telemetry::init(config.log_json)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    runtime.block_on(async {
+        let running = app::start(config).await?;
+        println!("listening on {}", running.url());
+        tokio::spawn(stop_on_signal(running.stopper()));
+        running.wait().await;
+        Ok(())
+    })
+}
+
+async fn stop_on_signal(stop: CancellationToken) {
+    signal().await;
+    tracing::info!("stopping");
+    stop.cancel();
+    signal().await;
+    std::process::exit(130);
+}
+
+/// Returns at the next SIGINT or SIGTERM.
+async fn signal() {
+    use tokio::signal::unix::{SignalKind, signal};
+    let Ok(mut terminate) = signal(SignalKind::terminate()) else {
+        tracing::error!("SIGTERM cannot be listened for");
+        return std::future::pending().await;
+    };
+    tokio::select! {
+        _ = tokio::signal::ctrl_c() => {}
+        _ = terminate.recv() => {}
+    }
+}

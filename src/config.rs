@@ -1,0 +1,195 @@
+//! Settings of the service: flags, then environment (`CAIRN_…`), then a TOML file, then the defaults.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use serde::Deserialize;
+
+use crate::jobs::WorkerOptions;
+
+/// Every setting, each possibly not given. The same names serve as flags, in the environment and in the file.
+#[derive(Debug, Clone, Default, PartialEq, Args, Deserialize)]
+#[serde(default, deny_unknown_fields, rename_all = "kebab-case")]
+pub struct Settings {
+    /// Address to listen on; port 0 takes a free one [default: 127.0.0.1:8080]
+    #[arg(long, env = "CAIRN_LISTEN", value_name = "ADDRESS")]
+    pub listen: Option<SocketAddr>,
+    /// Directory of all state [default: ./cairn-data]
+    #[arg(long, env = "CAIRN_DATA", value_name = "DIR")]
+    pub data: Option<PathBuf>,
+    /// Jobs at once [default: 2]
+    #[arg(long, env = "CAIRN_WORKERS", value_name = "N")]
+    pub workers: Option<usize>,
+    /// Threads that compute [default: one for each core]
+    #[arg(long, env = "CAIRN_THREADS", value_name = "N")]
+    pub threads: Option<usize>,
+    /// Largest upload, bytes [default: 17179869184, which is 16 GiB]
+    #[arg(long, env = "CAIRN_MAX_UPLOAD_BYTES", value_name = "BYTES")]
+    pub max_upload_bytes: Option<u64>,
+    /// Most points that one scan may have [default: 200000000]
+    #[arg(long, env = "CAIRN_MAX_POINTS", value_name = "N")]
+    pub max_points: Option<u64>,
+    /// Seconds after which a silent worker is taken for dead [default: 60]
+    #[arg(long, env = "CAIRN_LEASE_SECONDS", value_name = "SECONDS")]
+    pub lease_seconds: Option<u64>,
+    /// Seconds between looks at the queue when nothing happens [default: 2]
+    #[arg(long, env = "CAIRN_POLL_SECONDS", value_name = "SECONDS")]
+    pub poll_seconds: Option<u64>,
+    /// Seconds after which an upload that sends nothing is given up [default: 60]
+    #[arg(long, env = "CAIRN_UPLOAD_IDLE_SECONDS", value_name = "SECONDS")]
+    pub upload_idle_seconds: Option<u64>,
+    /// Scans that one mapping job takes at once, at most [default: 32]
+    #[arg(long, env = "CAIRN_BATCH", value_name = "N")]
+    pub batch: Option<u32>,
+    /// Write logs as JSON [default: false]
+    #[arg(long, env = "CAIRN_LOG_JSON", value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    pub log_json: Option<bool>,
+}
+
+/// What the service runs with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Config {
+    /// Address to listen on.
+    pub listen: SocketAddr,
+    /// Directory of all state.
+    pub data: PathBuf,
+    /// Threads that compute; 0 is one for each core.
+    pub threads: usize,
+    /// Largest upload, bytes.
+    pub max_upload_bytes: u64,
+    /// How long an upload may send nothing.
+    pub upload_idle: Duration,
+    /// The worker pool.
+    pub workers: WorkerOptions,
+    /// Whether logs are JSON.
+    pub log_json: bool,
+}
+
+/// Why settings are refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("{file}: {source}")]
+    Unreadable {
+        /// The file.
+        file: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is not TOML, or has a setting that does not exist.
+    #[error("{file}: {source}")]
+    Malformed {
+        /// The file.
+        file: PathBuf,
+        /// Where and why.
+        source: toml::de::Error,
+    },
+    /// A number that makes no sense.
+    #[error("{setting} is {value}; it must be between {least} and {most}")]
+    OutOfRange {
+        /// Which setting.
+        setting: &'static str,
+        /// What it is.
+        value: u64,
+        /// The least.
+        least: u64,
+        /// The most.
+        most: u64,
+    },
+}
+
+impl Settings {
+    /// Reads a TOML file.
+    pub fn from_file(file: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(file)
+            .map_err(|source| ConfigError::Unreadable { file: file.to_owned(), source })?;
+        toml::from_str(&text).map_err(|source| ConfigError::Malformed { file: file.to_owned(), source })
+    }
+
+    /// These settings, and those of `other` where these say nothing.
+    #[must_use]
+    pub fn or(self, other: Self) -> Self {
+        Self {
+            listen: self.listen.or(other.listen),
+            data: self.data.or(other.data),
+            workers: self.workers.or(other.workers),
+            threads: self.threads.or(other.threads),
+            max_upload_bytes: self.max_upload_bytes.or(other.max_upload_bytes),
+            max_points: self.max_points.or(other.max_points),
+            lease_seconds: self.lease_seconds.or(other.lease_seconds),
+            poll_seconds: self.poll_seconds.or(other.poll_seconds),
+            upload_idle_seconds: self.upload_idle_seconds.or(other.upload_idle_seconds),
+            batch: self.batch.or(other.batch),
+            log_json: self.log_json.or(other.log_json),
+        }
+    }
+
+    /// Checks what is given and fills in the defaults.
+    pub fn resolve(self) -> Result<Config, ConfigError> {
+        let workers = self.workers.map_or(2, |n| n as u64);
+        let threads = self.threads.map_or(0, |n| n as u64);
+        let seconds = |setting, given: Option<u64>, default| {
+            Ok(Duration::from_secs(within(setting, given.unwrap_or(default), 1, 86_400)?))
+        };
+        Ok(Config {
+            listen: self.listen.unwrap_or_else(|| SocketAddr::from(([127, 0, 0, 1], 8080))),
+            data: self.data.unwrap_or_else(|| PathBuf::from("cairn-data")),
+            threads: within("threads", threads, 0, 1024)? as usize,
+            max_upload_bytes: within(
+                "max-upload-bytes",
+                self.max_upload_bytes.unwrap_or(16 << 30),
+                1,
+                i64::MAX as u64,
+            )?,
+            upload_idle: seconds("upload-idle-seconds", self.upload_idle_seconds, 60)?,
+            workers: WorkerOptions {
+                workers: within("workers", workers, 1, 256)? as usize,
+                lease: seconds("lease-seconds", self.lease_seconds, 60)?,
+                poll: seconds("poll-seconds", self.poll_seconds, 2)?,
+                progress_every: Duration::from_millis(250),
+                batch: within("batch", self.batch.unwrap_or(32).into(), 1, 1000)? as u32,
+                max_points: within("max-points", self.max_points.unwrap_or(200_000_000), 1, u32::MAX.into())?,
+                grace: Duration::from_secs(20),
+            },
+            log_json: self.log_json.unwrap_or(false),
+        })
+    }
+}
+
+fn within(setting: &'static str, value: u64, least: u64, most: u64) -> Result<u64, ConfigError> {
+    if (least..=most).contains(&value) {
+        Ok(value)
+    } else {
+        Err(ConfigError::OutOfRange { setting, value, least, most })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn flags_win_over_the_file_and_the_file_over_the_defaults() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cairn.toml");
+        std::fs::write(&path, "listen = \"0.0.0.0:9000\"\nworkers = 7\n").unwrap();
+        let flags = Settings { workers: Some(3), ..Settings::default() };
+        let config = flags.or(Settings::from_file(&path).unwrap()).resolve().unwrap();
+        assert_eq!(config.workers.workers, 3);
+        assert_eq!(config.listen, SocketAddr::from(([0, 0, 0, 0], 9000)));
+        assert_eq!(config.workers.lease, Duration::from_secs(60));
+    }
+
+    #[test]
+    fn unknown_settings_and_numbers_that_make_no_sense_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cairn.toml");
+        std::fs::write(&path, "lisen = \"0.0.0.0:9000\"\n").unwrap();
+        assert!(Settings::from_file(&path).unwrap_err().to_string().contains("lisen"));
+        let settings = Settings { workers: Some(0), ..Settings::default() };
+        let message = settings.resolve().unwrap_err().to_string();
+        assert_eq!(message, "workers is 0; it must be between 1 and 256");
+    }
+}

@@ -1,0 +1,53 @@
+//! Extractors whose refusals are problems too.
+
+use axum::extract::rejection::JsonRejection;
+use axum::extract::{FromRequest, FromRequestParts, Path, Request};
+use axum::http::StatusCode;
+use axum::http::request::Parts;
+use serde::de::DeserializeOwned;
+
+use super::Problem;
+
+/// Ids in the path. One that is no id names nothing, so the answer is 404.
+pub(super) struct Ids<T>(pub T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for Ids<T> {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
+        match Path::<T>::from_request_parts(parts, state).await {
+            Ok(Path(ids)) => Ok(Self(ids)),
+            Err(_) => Err(Problem::not_found("the path holds something that is no id")),
+        }
+    }
+}
+
+/// A JSON body.
+pub(super) struct Body<T>(pub T);
+
+impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for Body<T> {
+    type Rejection = Problem;
+
+    async fn from_request(request: Request, state: &S) -> Result<Self, Problem> {
+        match axum::Json::<T>::from_request(request, state).await {
+            Ok(axum::Json(body)) => Ok(Self(body)),
+            Err(rejection) => Err(refusal(&rejection)),
+        }
+    }
+}
+
+fn refusal(rejection: &JsonRejection) -> Problem {
+    let status = rejection.status();
+    match rejection {
+        JsonRejection::JsonDataError(_) | JsonRejection::JsonSyntaxError(_) => {
+            Problem::invalid("body", rejection.body_text())
+        }
+        _ if status == StatusCode::PAYLOAD_TOO_LARGE => {
+            Problem::new(status, "too-large", "the JSON body has more than 2 MiB, which is the limit")
+        }
+        _ if status == StatusCode::UNSUPPORTED_MEDIA_TYPE => {
+            Problem::new(status, "not-json", "the body must be sent as content-type: application/json")
+        }
+        _ => Problem::invalid("body", rejection.body_text()),
+    }
+}

@@ -1,0 +1,88 @@
+//! `/v1/projects/{p}/graph`: which scans hold which in place.
+
+use axum::Json;
+use axum::extract::State;
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::extract::Ids;
+use super::model::{ComponentBody, components};
+use super::problem::{Problem, Problems};
+use super::query::Params;
+use super::router::Api;
+use crate::project::{ProjectId, ScanId, ScanState, Standing, VersionNumber};
+
+/// A scan in the graph.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct NodeBody {
+    /// The scan.
+    #[schema(value_type = String)]
+    scan: ScanId,
+    /// registered, waiting or failed.
+    #[schema(value_type = String)]
+    state: ScanState,
+    /// Its component, if it has one.
+    component: Option<usize>,
+    /// Verified edges to scans of its component.
+    neighbours: usize,
+}
+
+/// A verified edge.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct EdgeBody {
+    /// One scan.
+    #[schema(value_type = String)]
+    a: ScanId,
+    /// The other.
+    #[schema(value_type = String)]
+    b: ScanId,
+    /// Correspondences that agree with the edge's motion.
+    inliers: usize,
+    /// Overlap of the dense clouds under that motion, 0 to 1.
+    overlap: f64,
+}
+
+/// The scan graph of a version.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct GraphBody {
+    /// The version.
+    #[schema(value_type = u32)]
+    version: VersionNumber,
+    /// Every scan that the model knows, in order of arrival.
+    nodes: Vec<NodeBody>,
+    /// Verified edges.
+    edges: Vec<EdgeBody>,
+    /// Largest first.
+    components: Vec<ComponentBody>,
+}
+
+/// Shows the scan graph.
+#[utoipa::path(get, path = "/v1/projects/{project}/graph", tag = "model", params(
+    ("project" = String, Path, description = "Id of the project"),
+    ("version" = Option<u32>, Query, description = "Number of the version; the newest if absent")),
+    responses((status = 200, description = "The graph", body = GraphBody), Problems))]
+pub(super) async fn get_graph(
+    State(api): State<Api>,
+    Ids(project): Ids<ProjectId>,
+    mut query: Params,
+) -> Result<Json<GraphBody>, Problem> {
+    let version = query.version()?;
+    query.finish()?;
+    let (version, content) = api.store.content(project, version).await?;
+    let node = |(scan, standing): &(ScanId, Standing)| {
+        let (state, place) = match standing {
+            Standing::Registered(p) => (ScanState::Registered, Some(p)),
+            Standing::Waiting(_) => (ScanState::Waiting, None),
+            Standing::Failed(_) => (ScanState::Failed, None),
+        };
+        let neighbours = place.map_or(0, |p| p.neighbours);
+        NodeBody { scan: *scan, state, component: place.map(|p| p.component), neighbours }
+    };
+    let edges = content.edges.iter();
+    Ok(Json(GraphBody {
+        version,
+        nodes: content.scans.iter().map(node).collect(),
+        edges: edges.map(|e| EdgeBody { a: e.a, b: e.b, inliers: e.inliers, overlap: e.overlap }).collect(),
+        components: components(content.components),
+    }))
+}

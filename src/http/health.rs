@@ -1,0 +1,38 @@
+//! `/healthz`, `/readyz` and `/openapi.yaml`.
+
+use axum::extract::State;
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
+
+use super::problem::Problem;
+use super::router::Api;
+
+/// Says that the process answers.
+#[utoipa::path(get, path = "/healthz", tag = "service",
+    responses((status = 200, description = "It answers", body = String, content_type = "text/plain")))]
+pub(super) async fn healthz() -> &'static str {
+    "ok\n"
+}
+
+/// Says whether requests make sense now: the database can be read, and the service is not stopping.
+#[utoipa::path(get, path = "/readyz", tag = "service", responses(
+    (status = 200, description = "It is ready", body = String, content_type = "text/plain"),
+    (status = 503, description = "It is stopping, or cannot read its data", body = Problem, content_type = "application/problem+json")))]
+pub(super) async fn readyz(State(api): State<Api>) -> Result<&'static str, Problem> {
+    let not_ready = |detail| Problem::new(StatusCode::SERVICE_UNAVAILABLE, "not-ready", detail);
+    if api.stop.is_cancelled() {
+        return Err(not_ready("the service is stopping"));
+    }
+    api.store.ping().await.map_err(|error| {
+        tracing::error!(%error, "the database cannot be read");
+        not_ready("the service cannot read its data")
+    })?;
+    Ok("ready\n")
+}
+
+/// The description of this interface.
+#[utoipa::path(get, path = "/openapi.yaml", tag = "service",
+    responses((status = 200, description = "OpenAPI 3.1", body = String, content_type = "application/yaml")))]
+pub(super) async fn openapi(State(api): State<Api>) -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "application/yaml")], api.openapi.as_ref().to_owned())
+}

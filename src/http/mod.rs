@@ -1,0 +1,25 @@
+//! The REST interface: one file per resource, each with its handlers, their DTOs and their OpenAPI words.
+//!
+//! Uses `project`, `storage` and the entrances of `jobs`; `app` serves the router. Handlers parse, make one call, and
+//! answer; every error is problem+json ([`Problem`]).
+
+mod cloud;
+mod download;
+mod events;
+mod extract;
+mod graph;
+mod health;
+mod job;
+mod link;
+mod model;
+mod page;
+mod pose;
+mod problem;
+mod project;
+mod query;
+mod router;
+mod scan;
+mod upload;
+
+pub use problem::Problem;
+pub use router::{Api, openapi_yaml, router};

@@ -1,0 +1,194 @@
+//! `/v1/projects/{p}/poses`: poses as JSON or in the text forms of other programs.
+
+use std::collections::BTreeMap;
+
+use axum::Json;
+use axum::extract::State;
+use axum::http::{HeaderName, header};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::extract::Ids;
+use super::problem::{Problem, Problems};
+use super::query::Params;
+use super::router::Api;
+use crate::geometry::Pose;
+use crate::geometry::pose_text::{LogEntry, to_kitti, to_log, to_tum};
+use crate::project::{ModelContent, ProjectId, ScanId, Standing, VersionNumber};
+use crate::storage::Store;
+
+/// A scan's pose.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct PoseBody {
+    /// The scan.
+    #[schema(value_type = String)]
+    scan: ScanId,
+    /// `model_from_scan`: 4x4, row-major, metres; null while the scan waits.
+    #[schema(value_type = Option<Vec<Vec<f64>>>)]
+    pose: Option<[[f64; 4]; 4]>,
+    /// The component in whose frame the pose is; 0 is the largest.
+    component: Option<usize>,
+}
+
+/// Poses of a version.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct PosesBody {
+    /// The version.
+    #[schema(value_type = u32)]
+    version: VersionNumber,
+    /// By name of the scan; names that occur twice have the scan's id behind them.
+    scans: BTreeMap<String, PoseBody>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Form {
+    Json,
+    Tum,
+    Log,
+    Kitti,
+}
+
+impl Form {
+    fn from_word(word: &str) -> Option<Self> {
+        match word {
+            "json" => Some(Self::Json),
+            "tum" => Some(Self::Tum),
+            "3dmatch-log" => Some(Self::Log),
+            "kitti" => Some(Self::Kitti),
+            _ => None,
+        }
+    }
+}
+
+/// A scan of the version with its name.
+struct Named {
+    scan: ScanId,
+    name: String,
+    place: Option<(usize, Pose)>,
+}
+
+/// Downloads poses. `json` and `3dmatch-log` hold all components unless one is chosen; `tum` and `kitti` hold one, the
+/// largest if none is chosen, because their poses are all in one frame. `3dmatch-log` holds every pair of scans that
+/// share a component; its numbers count all scans of the version in the natural order of their names, from 0.
+#[utoipa::path(get, path = "/v1/projects/{project}/poses", tag = "model", params(
+    ("project" = String, Path, description = "Id of the project"),
+    ("format" = Option<String>, Query, description = "json (if absent), tum, 3dmatch-log or kitti"),
+    ("version" = Option<u32>, Query, description = "Number of the version; the newest if absent"),
+    ("component" = Option<u32>, Query, description = "Only this component")),
+    responses(
+    (status = 200, description = "The poses", content((PosesBody = "application/json"), (String = "text/plain")),
+        headers(("cairn-version" = u32, description = "Number of the version"))),
+    Problems))]
+pub(super) async fn get_poses(
+    State(api): State<Api>,
+    Ids(project): Ids<ProjectId>,
+    mut query: Params,
+) -> Result<Response, Problem> {
+    let form =
+        query.with("format", "json, tum, 3dmatch-log or kitti", Form::from_word)?.unwrap_or(Form::Json);
+    let version = query.version()?;
+    let component = query.value("component", "the index of a component")?;
+    query.finish()?;
+    let (version, content) = api.store.content(project, version).await?;
+    let scans = named(&api.store, project, &content, component).await?;
+    let of = |component: usize| {
+        scans.iter().filter_map(move |s| {
+            let (c, pose) = s.place?;
+            (c == component).then_some((s.name.as_str(), pose))
+        })
+    };
+    let text = match form {
+        Form::Json => {
+            let body = PosesBody { version, scans: bodies(scans) };
+            return Ok(([(HeaderName::from_static("cairn-version"), version.to_string())], Json(body))
+                .into_response());
+        }
+        Form::Tum => to_tum(of(component.unwrap_or(0))),
+        Form::Kitti => to_kitti(of(component.unwrap_or(0)).map(|(_, pose)| pose)),
+        Form::Log => tokio::task::spawn_blocking(move || log(&scans)).await.map_err(Problem::internal)?,
+    };
+    let headers = [
+        (header::CONTENT_TYPE, "text/plain; charset=utf-8".to_owned()),
+        (HeaderName::from_static("cairn-version"), version.to_string()),
+    ];
+    Ok((headers, text).into_response())
+}
+
+/// The scans of a version in the natural order of their names.
+async fn named(
+    store: &Store,
+    project: ProjectId,
+    content: &ModelContent,
+    component: Option<usize>,
+) -> Result<Vec<Named>, Problem> {
+    let mut scans = Vec::new();
+    for (scan, _) in store.scans_ever(project).await? {
+        let place = match content.standing(scan.id) {
+            None => continue,
+            Some(Standing::Registered(p)) => Some((p.component, p.model_from_scan)),
+            Some(_) => None,
+        };
+        let place = place.filter(|(c, _)| component.is_none_or(|wanted| wanted == *c));
+        scans.push(Named { scan: scan.id, name: scan.name.to_string(), place });
+    }
+    scans.sort_by_cached_key(|s| (natural(&s.name), s.scan));
+    Ok(scans)
+}
+
+fn bodies(scans: Vec<Named>) -> BTreeMap<String, PoseBody> {
+    let mut bodies = BTreeMap::new();
+    for Named { scan, name, place } in scans {
+        let name = if bodies.contains_key(&name) { format!("{name} ({scan})") } else { name };
+        let (component, pose) = (place.map(|(c, _)| c), place.map(|(_, pose)| pose.to_rows()));
+        bodies.insert(name, PoseBody { scan, pose, component });
+    }
+    bodies
+}
+
+/// Every pair of scans that share a component.
+fn log(scans: &[Named]) -> String {
+    let n = u32::try_from(scans.len()).unwrap_or(u32::MAX);
+    let numbered = || (0u32..).zip(scans).filter_map(|(i, s)| s.place.map(|(c, pose)| (i, c, pose)));
+    let mut entries = Vec::new();
+    for (i, component_i, model_from_i) in numbered() {
+        let others = numbered().filter(|(j, c, _)| *j > i && *c == component_i);
+        entries.extend(others.map(|(j, _, model_from_j)| LogEntry {
+            i,
+            j,
+            n,
+            i_from_j: model_from_i.inverse() * model_from_j,
+        }));
+    }
+    to_log(&entries)
+}
+
+/// A key by which `scan_10` sorts after `scan_9`: the name with its runs of digits padded.
+fn natural(name: &str) -> String {
+    let mut key = String::new();
+    let mut digits = String::new();
+    for c in name.chars().chain(std::iter::once('\0')) {
+        if c.is_ascii_digit() {
+            digits.push(c);
+            continue;
+        }
+        if !digits.is_empty() {
+            key.push_str(&format!("{:0>20}", digits.trim_start_matches('0')));
+            digits.clear();
+        }
+        key.push(c);
+    }
+    key
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_sort_by_their_numbers() {
+        let mut names = ["cloud_bin_10.ply", "cloud_bin_9.ply", "cloud_bin_0.ply", "b2"];
+        names.sort_by_cached_key(|n| natural(n));
+        assert_eq!(names, ["b2", "cloud_bin_0.ply", "cloud_bin_9.ply", "cloud_bin_10.ply"]);
+    }
+}

@@ -1,0 +1,126 @@
+//! The routes, the layers around them, and the OpenAPI description that is read off them.
+
+use std::any::Any;
+use std::sync::Arc;
+
+use axum::Router;
+use axum::extract::Request;
+use axum::http::{HeaderName, HeaderValue, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use tokio_util::sync::CancellationToken;
+use tower::ServiceBuilder;
+use tower_http::catch_panic::CatchPanicLayer;
+use tower_http::request_id::{MakeRequestId, PropagateRequestIdLayer, RequestId, SetRequestIdLayer};
+use tower_http::trace::TraceLayer;
+use ulid::Ulid;
+use utoipa::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::{Problem, cloud, events, graph, health, job, model, page, pose, project, scan, upload};
+use crate::jobs::{Exports, Intake};
+use crate::storage::Store;
+
+/// What handlers work with. Clones share everything.
+#[derive(Clone)]
+pub struct Api {
+    /// Rows and blobs.
+    pub store: Store,
+    /// Takes uploads in.
+    pub intake: Intake,
+    /// Makes files for download.
+    pub exports: Exports,
+    /// Cancelled when the service begins to stop: long answers end then.
+    pub stop: CancellationToken,
+    /// The description of the interface, YAML.
+    pub openapi: Arc<str>,
+}
+
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "Cairn",
+        description = "Multiview scan registration. Upload scans into a project; each is added to the project's model \
+            by a job; poll the job, then download poses and the merged cloud. Poses are `model_from_scan`: they map \
+            points of a scan into the frame of its component. Lengths are metres. Errors are RFC 9457 problem details."
+    ),
+    tags(
+        (name = "projects", description = "Sets of scans of one place"),
+        (name = "scans", description = "Uploads"),
+        (name = "jobs", description = "Work in progress, in the words of OGC API Processes"),
+        (name = "model", description = "Versions of a project's model, and what can be downloaded of them"),
+        (name = "service", description = "The service itself"),
+    )
+)]
+struct Description;
+
+fn routes() -> OpenApiRouter<Api> {
+    OpenApiRouter::with_openapi(Description::openapi())
+        .routes(routes!(project::create_project, project::list_projects))
+        .routes(routes!(project::get_project, project::delete_project))
+        .routes(routes!(upload::upload_scan, scan::list_scans))
+        .routes(routes!(scan::get_scan, scan::delete_scan))
+        .routes(routes!(scan::get_original))
+        .routes(routes!(job::create_job, job::list_jobs))
+        .routes(routes!(job::get_job, job::dismiss_job))
+        .routes(routes!(events::follow_job))
+        .routes(routes!(model::get_model))
+        .routes(routes!(model::list_versions))
+        .routes(routes!(model::get_version))
+        .routes(routes!(pose::get_poses))
+        .routes(routes!(cloud::get_cloud))
+        .routes(routes!(graph::get_graph))
+        .routes(routes!(health::healthz))
+        .routes(routes!(health::readyz))
+        .routes(routes!(health::openapi))
+}
+
+/// The description of the interface as YAML: what `/openapi.yaml` answers and the repository keeps.
+pub fn openapi_yaml() -> Result<String, Problem> {
+    routes().into_openapi().to_yaml().map_err(Problem::internal)
+}
+
+/// The whole service as a router.
+pub fn router(api: Api) -> Router {
+    let id = HeaderName::from_static("x-request-id");
+    let layers = ServiceBuilder::new()
+        .layer(SetRequestIdLayer::new(id.clone(), NewRequestId))
+        .layer(TraceLayer::new_for_http().make_span_with(span))
+        .layer(PropagateRequestIdLayer::new(id))
+        .layer(CatchPanicLayer::custom(panicked));
+    let (router, _) = routes().split_for_parts();
+    router
+        .route("/", get(page::index))
+        .route("/web/{name}", get(page::asset))
+        .fallback(|| async { Problem::not_found("there is nothing at this address") })
+        .method_not_allowed_fallback(|| async {
+            Problem::new(
+                StatusCode::METHOD_NOT_ALLOWED,
+                "method-not-allowed",
+                "this address does not answer this method",
+            )
+        })
+        .with_state(api)
+        .layer(layers)
+}
+
+#[derive(Clone, Copy)]
+struct NewRequestId;
+
+impl MakeRequestId for NewRequestId {
+    fn make_request_id<B>(&mut self, _: &axum::http::Request<B>) -> Option<RequestId> {
+        HeaderValue::from_str(&Ulid::generate().to_string()).ok().map(RequestId::new)
+    }
+}
+
+/// One span a request. The query is left out: names of scans are the client's business.
+fn span(request: &Request) -> tracing::Span {
+    let id = request.headers().get("x-request-id").and_then(|v| v.to_str().ok()).unwrap_or("");
+    tracing::info_span!("request", id, method = %request.method(), path = request.uri().path())
+}
+
+/// A handler panicked: the client learns only that.
+fn panicked(_: Box<dyn Any + Send + 'static>) -> Response {
+    Problem::internal("a handler panicked").into_response()
+}

@@ -1,0 +1,166 @@
+//! Files that are made for download: merged clouds and pictures. Each is a pure function of a version and its
+//! parameters, built once and kept as a blob.
+
+use std::fs::File;
+use std::io::{self, BufWriter};
+use std::sync::Arc;
+
+use tokio::sync::Mutex;
+
+use super::merge::Merge;
+use super::{Compute, JobError, Panicked};
+use crate::cloud::PlyWriter;
+use crate::project::{ModelContent, Placement, ProjectId, Scan};
+use crate::storage::{StorageError, Store, StoredBlob};
+
+/// Which part of a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ComponentChoice {
+    /// One component; 0 is the largest.
+    One(usize),
+    /// All of them, each in its own frame, which have nothing to do with one another.
+    All,
+}
+
+/// A cloud to be made.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CloudRequest {
+    /// Of which part.
+    pub component: ComponentChoice,
+    /// One point for each occupied cube of this edge, metres; `None`: every point.
+    pub voxel: Option<f64>,
+}
+
+/// Why a file cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// The version has no such component, or no registered scan at all.
+    #[error("no scan is registered in this component of this version")]
+    NothingThere,
+    /// State could not be read or written.
+    #[error(transparent)]
+    Storage(#[from] StorageError),
+    /// The file could not be written.
+    #[error("writing an export: {0}")]
+    Io(#[from] io::Error),
+    /// A computation failed.
+    #[error(transparent)]
+    Panicked(#[from] Panicked),
+    /// An upload that was readable once is not any more.
+    #[error("a registered scan cannot be read: {0}")]
+    Unreadable(#[from] JobError),
+}
+
+/// Makes and remembers exports. Clones share everything.
+#[derive(Debug, Clone)]
+pub struct Exports {
+    store: Store,
+    compute: Compute,
+    max_points: u64,
+    /// One at a time: a merged cloud may take gigabytes of disk and all threads.
+    building: Arc<Mutex<()>>,
+}
+
+/// Names the form of the exported files; another one makes old ones unreachable.
+const FORM: &str = "export/1";
+
+impl Exports {
+    /// Exports from this store. Uploads of more than `max_points` were never accepted.
+    #[must_use]
+    pub fn new(store: Store, compute: Compute, max_points: u64) -> Self {
+        Self { store, compute, max_points, building: Arc::default() }
+    }
+
+    /// The merged cloud of a version as binary PLY, in metres, in the frame of its component.
+    pub async fn cloud(
+        &self,
+        project: ProjectId,
+        content: &ModelContent,
+        request: CloudRequest,
+    ) -> Result<StoredBlob, ExportError> {
+        let placed = self.placed(project, content, request.component).await?;
+        let key = key(&format!("cloud {:?}", request.voxel), &placed);
+        let blobs = self.store.blobs.clone();
+        let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
+        self.made(key, move || blobs.put_with(|file| write_ply(file, &merge, request.voxel))).await
+    }
+
+    /// The remembered file, or the one that `make` makes.
+    async fn made(
+        &self,
+        key: blake3::Hash,
+        make: impl FnOnce() -> Result<StoredBlob, ExportError> + Send + 'static,
+    ) -> Result<StoredBlob, ExportError> {
+        if let Some(found) = self.store.derived(&key).await? {
+            return Ok(found);
+        }
+        let _turn = self.building.lock().await;
+        // Whoever was before us may have made it.
+        if let Some(found) = self.store.derived(&key).await? {
+            return Ok(found);
+        }
+        let stored = self.compute.run(make).await??;
+        self.store.remember(&key, stored).await?;
+        Ok(stored)
+    }
+
+    /// The scans that take part, in order of arrival.
+    async fn placed(
+        &self,
+        project: ProjectId,
+        content: &ModelContent,
+        component: ComponentChoice,
+    ) -> Result<Vec<(Scan, Placement)>, ExportError> {
+        let component = match component {
+            ComponentChoice::One(index) => Some(index),
+            ComponentChoice::All => None,
+        };
+        let scans = self.store.scans_ever(project).await?;
+        let placed: Vec<(Scan, Placement)> = scans
+            .into_iter()
+            .filter_map(|(scan, _)| {
+                let place = content.placed(component).find(|(id, _)| *id == scan.id)?.1.clone();
+                Some((scan, place))
+            })
+            .collect();
+        if placed.is_empty() { Err(ExportError::NothingThere) } else { Ok(placed) }
+    }
+}
+
+/// Hash of what goes into an export: its form and parameters, and every scan with its pose.
+fn key(parameters: &str, placed: &[(Scan, Placement)]) -> blake3::Hash {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(format!("{FORM} {parameters}").as_bytes());
+    for (scan, place) in placed {
+        hasher.update(&scan.key.0.to_le_bytes());
+        hasher.update(&(place.component as u64).to_le_bytes());
+        for x in place.model_from_scan.to_rows().into_iter().flatten() {
+            hasher.update(&x.to_le_bytes());
+        }
+    }
+    hasher.finalize()
+}
+
+fn write_ply(file: &mut File, merge: &Merge, voxel: Option<f64>) -> Result<(), ExportError> {
+    let offset = merge.offset();
+    let mut comments = vec!["made by cairn; metres".to_owned()];
+    if offset != [0.0; 3] {
+        let [x, y, z] = offset;
+        comments.push(format!("add the offset {x} {y} {z} to every point"));
+    }
+    let comments: Vec<&str> = comments.iter().map(String::as_str).collect();
+    let out = BufWriter::with_capacity(1 << 20, file);
+    let mut ply = PlyWriter::new(out, merge.colored(), &comments)?;
+    match voxel {
+        None => merge.visit(&offset, |_, point, color| {
+            Ok(ply.colored_point([point.x as f32, point.y as f32, point.z as f32], color)?)
+        })?,
+        Some(edge) => {
+            for (point, color) in merge.thinned(&offset, edge)? {
+                ply.colored_point(point, color)?;
+            }
+        }
+    }
+    ply.finish()?;
+    Ok(())
+}

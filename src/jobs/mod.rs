@@ -1,0 +1,30 @@
+//! The work behind the API: taking uploads in, the queue's workers, one file per kind of job, and the files that are
+//! made for download.
+//!
+//! Uses `storage` for all state and the core for all computation; `http` calls [`Intake`] and [`Exports`], `app` runs
+//! the [`Workers`]. The only bridge from tokio to rayon is in `compute`.
+
+mod compute;
+mod content;
+mod error;
+mod exports;
+mod ingest;
+mod intake;
+mod merge;
+mod model_cache;
+mod originals;
+mod parameters;
+mod prepared;
+mod progress;
+mod refine;
+mod register;
+mod remove;
+mod session;
+mod workers;
+
+pub use crate::cloud::metres_per_unit;
+pub use compute::{Compute, Panicked};
+pub use error::JobError;
+pub use exports::{CloudRequest, ComponentChoice, ExportError, Exports};
+pub use intake::{Intake, IntakeError, UploadRequest};
+pub use workers::{WorkerOptions, Workers};

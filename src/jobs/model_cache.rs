@@ -1,0 +1,56 @@
+//! The live models of projects that were worked on lately, so that the next scan need not read everything back.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, PoisonError};
+
+use crate::mapping::LiveModel;
+use crate::project::{ProjectId, VersionNumber};
+
+/// At most so many models at once, least recently used first out.
+const CAPACITY: usize = 4;
+
+/// Models by project, each exactly as its version was published.
+#[derive(Debug, Default)]
+pub(super) struct ModelCache {
+    models: Mutex<VecDeque<(ProjectId, VersionNumber, LiveModel)>>,
+}
+
+impl ModelCache {
+    /// A copy of the model of this version, if it is here.
+    pub fn get(&self, project: ProjectId, version: VersionNumber) -> Option<LiveModel> {
+        let mut models = self.models.lock().unwrap_or_else(PoisonError::into_inner);
+        let at = models.iter().position(|(p, v, _)| *p == project && *v == version)?;
+        let found = models.remove(at)?;
+        let model = found.2.clone();
+        models.push_back(found);
+        Some(model)
+    }
+
+    /// Keeps the model of a version in place of an older one of the project.
+    pub fn put(&self, project: ProjectId, version: VersionNumber, model: LiveModel) {
+        let mut models = self.models.lock().unwrap_or_else(PoisonError::into_inner);
+        models.retain(|(p, _, _)| *p != project);
+        models.push_back((project, version, model));
+        while models.len() > CAPACITY {
+            models.pop_front();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mapping::MappingOptions;
+
+    #[test]
+    fn only_the_asked_version_is_found_and_the_oldest_project_goes_first() {
+        let cache = ModelCache::default();
+        let ids: Vec<ProjectId> = (0..5).map(|i| ProjectId(i.into())).collect();
+        for id in &ids {
+            cache.put(*id, VersionNumber(1), LiveModel::new(MappingOptions::default()));
+        }
+        assert!(cache.get(ids[0], VersionNumber(1)).is_none());
+        assert!(cache.get(ids[4], VersionNumber(1)).is_some());
+        assert!(cache.get(ids[4], VersionNumber(2)).is_none());
+    }
+}

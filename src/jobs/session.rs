@@ -1,0 +1,280 @@
+//! One job at work: what it may use ([`Task`]), and the project's model while the job changes it ([`Session`]).
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use serde_json::Value;
+
+use super::content::content_of;
+use super::model_cache::ModelCache;
+use super::parameters::{Parameters, content_key, scan_key};
+use super::prepared::prepared;
+use super::progress::ProgressSink;
+use super::workers::WorkerOptions;
+use super::{Compute, JobError, Panicked};
+use crate::control::{CancelToken, Control};
+use crate::features::PreparedScan;
+use crate::mapping::{LiveModel, ModelSnapshot};
+use crate::pairwise::PairResult;
+use crate::project::{
+    ContentKey, Fault, JobId, ModelContent, Project, ProjectId, Scan, ScanId, Standing, VersionNumber,
+};
+use crate::storage::{BlobId, Claim, NewVersion, Publication, ScanChange, Store};
+
+/// What a job may use.
+pub(super) struct Task {
+    pub store: Store,
+    pub compute: Compute,
+    pub models: Arc<ModelCache>,
+    pub options: WorkerOptions,
+    pub claim: Claim,
+    pub cancel: CancelToken,
+    pub progress: Arc<ProgressSink>,
+}
+
+impl Task {
+    /// Runs a part of the job in the thread pool, under the job's cancellation and progress.
+    pub async fn compute<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(Control<'_>) -> T + Send + 'static,
+    ) -> Result<T, Panicked> {
+        let (cancel, progress) = (self.cancel.clone(), Arc::clone(&self.progress));
+        self.compute.run(move || work(Control { cancel: &cancel, observer: &*progress })).await
+    }
+}
+
+/// A project's model in the hands of the one job that may change it.
+pub(super) struct Session {
+    pub project: Project,
+    /// Under which scans are prepared and pairs matched.
+    pub parameters: Parameters,
+    /// A copy: the cached one stays as it is until this one is published.
+    pub model: LiveModel,
+    /// The version that the job starts from, as readers see it.
+    pub before: ModelContent,
+    /// Hash of that version's snapshot.
+    snapshot_before: Option<BlobId>,
+    /// Scans that cannot take part after all, found on the way.
+    pub unfit: Vec<(ScanId, Fault)>,
+}
+
+impl Session {
+    /// Opens the newest version of a project's model.
+    pub async fn open(task: &Task, project: ProjectId) -> Result<Self, JobError> {
+        let project = task.store.project(project).await?;
+        let chosen = Parameters::choose(&task.store, &project).await?;
+        if project.head == VersionNumber::EMPTY {
+            return Ok(Self {
+                model: LiveModel::new(chosen.mapping_options()),
+                parameters: chosen,
+                project,
+                before: ModelContent::default(),
+                snapshot_before: None,
+                unfit: Vec::new(),
+            });
+        }
+        let (version, engine) = task.store.version(project.id, project.head).await?;
+        let parameters = Parameters { resolution: version.resolution, seed: project.settings.seed };
+        let snapshot = BlobId::parse(&version.snapshot)?;
+        let (_, before) = task.store.content(project.id, Some(project.head)).await?;
+        let mut session = Self {
+            model: LiveModel::new(parameters.mapping_options()),
+            parameters,
+            project,
+            before,
+            snapshot_before: Some(snapshot),
+            unfit: Vec::new(),
+        };
+        if engine != parameters.engine() {
+            // Another engine made this model: what it stored means nothing to this one.
+            session.remake(task, parameters, Vec::new()).await?;
+        } else if let Some(model) = task.models.get(session.project.id, session.project.head) {
+            session.model = model;
+        } else {
+            session.restore(task, snapshot).await?;
+        }
+        Ok(session)
+    }
+
+    /// Reads the model back from its snapshot, its prepared scans and its pairs.
+    async fn restore(&mut self, task: &Task, snapshot: BlobId) -> Result<(), JobError> {
+        let blobs = task.store.blobs.clone();
+        let bytes = task.compute(move |_| blobs.get(snapshot)).await??;
+        let snapshot =
+            ModelSnapshot::from_bytes(&bytes).map_err(|e| JobError::for_good("damaged-data", e))?;
+        let by_key = self.scans_by_key(task).await?;
+        let mut scans = Vec::with_capacity(snapshot.scans.len());
+        for key in snapshot.scans.keys() {
+            let Some(scan) = by_key.get(&content_key(*key)) else { continue };
+            scans.push(prepared(task, scan, self.parameters).await?);
+        }
+        let rows = task.store.pairs(self.project.id, &self.parameters.engine()).await?;
+        let options = self.parameters.mapping_options();
+        self.model = task
+            .compute(move |_| -> Result<LiveModel, JobError> {
+                let known = |key| snapshot.scans.contains_key(&key);
+                let mut pairs = Vec::with_capacity(rows.len());
+                for row in rows {
+                    let result: PairResult =
+                        postcard::from_bytes(&row).map_err(|e| JobError::for_good("damaged-data", e))?;
+                    if known(result.pair.a) && known(result.pair.b) {
+                        pairs.push(result);
+                    }
+                }
+                Ok(LiveModel::restore(options, &snapshot, scans, pairs)?)
+            })
+            .await??;
+        Ok(())
+    }
+
+    /// Makes the model anew under other parameters, from the uploads of its scans and of `more`. A scan that turns out
+    /// unfit is left out and noted.
+    pub async fn remake(
+        &mut self,
+        task: &Task,
+        parameters: Parameters,
+        more: Vec<Scan>,
+    ) -> Result<(), JobError> {
+        let by_key = self.scans_by_key(task).await?;
+        let known: HashMap<ScanId, &Scan> = by_key.values().map(|s| (s.id, s)).collect();
+        let old = self.before.scans.iter().filter(|(_, s)| !matches!(s, Standing::Failed(_)));
+        let mut all: Vec<Scan> = old.filter_map(|(id, _)| known.get(id).map(|s| (*s).clone())).collect();
+        all.extend(more);
+        self.parameters = parameters;
+        self.model = LiveModel::new(parameters.mapping_options());
+        self.extend(task, all).await
+    }
+
+    /// Adds scans to the model. A scan that turns out unfit is left out and noted.
+    pub async fn extend(&mut self, task: &Task, scans: Vec<Scan>) -> Result<(), JobError> {
+        let mut fit: Vec<Arc<PreparedScan>> = Vec::with_capacity(scans.len());
+        for scan in scans {
+            match prepared(task, &scan, self.parameters).await {
+                Ok(prepared) => fit.push(prepared),
+                Err(JobError::Failed { fault, retry: false }) => self.unfit.push((scan.id, fault)),
+                Err(other) => return Err(other),
+            }
+        }
+        self.change(task, move |model, control| model.register(fit, control)).await??;
+        Ok(())
+    }
+
+    /// Changes the model in the thread pool.
+    pub async fn change<T: Send + 'static>(
+        &mut self,
+        task: &Task,
+        change: impl FnOnce(&mut LiveModel, Control<'_>) -> T + Send + 'static,
+    ) -> Result<T, JobError> {
+        let empty = LiveModel::new(self.parameters.mapping_options());
+        let mut model = std::mem::replace(&mut self.model, empty);
+        let (model, result) = task
+            .compute(move |control| {
+                let result = change(&mut model, control);
+                (model, result)
+            })
+            .await?;
+        self.model = model;
+        Ok(result)
+    }
+
+    /// Publishes what has become of the model, if anything has. `outcome` is asked for the end of each job of the claim,
+    /// given the content and the number of the version that readers see from now on.
+    pub async fn publish(
+        mut self,
+        task: &Task,
+        outcome: impl Fn(&ModelContent, VersionNumber, JobId) -> Result<Value, Fault>,
+    ) -> Result<(), JobError> {
+        let by_key = self.scans_by_key(task).await?;
+        let blobs = task.store.blobs.clone();
+        let (parameters, old) = (self.parameters, self.snapshot_before);
+        let (model, written, pairs) = {
+            let empty = LiveModel::new(parameters.mapping_options());
+            let mut model = std::mem::replace(&mut self.model, empty);
+            task.compute(move |_| -> Result<_, JobError> {
+                let pairs = stored_pairs(model.take_new_pairs())?;
+                let snapshot = model.snapshot();
+                let bytes = snapshot.to_bytes().map_err(|e| JobError::for_good("internal-error", e))?;
+                let stored = blobs.put(&bytes)?;
+                let content = content_of(&snapshot, &by_key, parameters.resolution);
+                let nothing = old.is_none() && content.scans.is_empty();
+                if nothing || old == Some(stored.id) {
+                    return Ok((model, None, pairs));
+                }
+                let bytes =
+                    serde_json::to_vec(&content).map_err(|e| JobError::for_good("internal-error", e))?;
+                let readable = blobs.put(&bytes)?;
+                Ok((model, Some((stored.id, readable.id, content)), pairs))
+            })
+            .await??
+        };
+        let from = self.project.head;
+        let number = if written.is_some() { from.next() } else { from };
+        let (version, content) = match written {
+            Some((snapshot, readable, content)) => (Some(new_version(snapshot, readable, &content)), content),
+            None => (None, self.before.clone()),
+        };
+        let publication = Publication {
+            project: self.project.id,
+            kind: task.claim.job.kind,
+            from,
+            version,
+            pairs,
+            engine: parameters.engine(),
+            scans: changes(&self.before, &content, &self.unfit),
+            outcomes: task.claim.lease.all().map(|job| (job, outcome(&content, number, job))).collect(),
+        };
+        task.store.publish(&task.claim.lease, &publication).await?;
+        task.models.put(self.project.id, number, model);
+        Ok(())
+    }
+
+    /// The project's scans by what the engine calls them. Of two with the same content, one was deleted.
+    async fn scans_by_key(&self, task: &Task) -> Result<HashMap<ContentKey, Scan>, JobError> {
+        let mut by_key = HashMap::new();
+        for (scan, deleted) in task.store.scans_ever(self.project.id).await? {
+            if !deleted || !by_key.contains_key(&scan.key) {
+                by_key.insert(scan.key, scan);
+            }
+        }
+        Ok(by_key)
+    }
+
+    /// Takes a scan out of the model. Returns whether it was there.
+    pub fn remove(&mut self, scan: ContentKey) -> bool {
+        self.model.remove(scan_key(scan))
+    }
+}
+
+fn new_version(snapshot: BlobId, readable: BlobId, content: &ModelContent) -> NewVersion {
+    let registered = content.placed(None).count();
+    NewVersion {
+        snapshot,
+        content: readable,
+        resolution: content.resolution,
+        components: content.components.len(),
+        registered,
+        waiting: content.scans.len() - registered,
+    }
+}
+
+/// Scans whose standing differs between two versions, and those that fell out.
+fn changes(before: &ModelContent, after: &ModelContent, unfit: &[(ScanId, Fault)]) -> Vec<ScanChange> {
+    let old: HashMap<ScanId, &Standing> = before.scans.iter().map(|(id, s)| (*id, s)).collect();
+    let moved = after.scans.iter().filter(|(id, standing)| old.get(id) != Some(&standing));
+    moved
+        .cloned()
+        .chain(unfit.iter().map(|(id, fault)| (*id, Standing::Failed(fault.clone()))))
+        .map(|(scan, standing)| ScanChange { scan, standing })
+        .collect()
+}
+
+/// Results of pairs as they are stored.
+fn stored_pairs(pairs: Vec<PairResult>) -> Result<Vec<(ContentKey, ContentKey, Vec<u8>)>, JobError> {
+    pairs
+        .into_iter()
+        .map(|result| {
+            let bytes = postcard::to_stdvec(&result).map_err(|e| JobError::for_good("internal-error", e))?;
+            Ok((content_key(result.pair.a), content_key(result.pair.b), bytes))
+        })
+        .collect()
+}

@@ -1,0 +1,19 @@
+//! What a project is, as plain data: ids, settings, scans, jobs, model versions. No SQL, no HTTP, no engine.
+//!
+//! Uses [`crate::geometry`]; `storage` keeps these types, `jobs` works on them and `http` shows them.
+
+mod id;
+mod job;
+mod model;
+mod name;
+mod scan;
+mod settings;
+mod time;
+
+pub use id::{BadId, JobId, ProjectId, ScanId, VersionNumber};
+pub use job::{BadJobKind, Fault, Job, JobKind, JobState, Lane};
+pub use model::{Component, Edge, ModelContent, Placement, Reason, Standing, Version};
+pub use name::{BadName, Name};
+pub use scan::{BadInterpretation, ContentKey, Interpretation, Scan, ScanState};
+pub use settings::{BadSettings, Project, ProjectSettings};
+pub use time::Timestamp;

@@ -1,0 +1,75 @@
+//! What can go wrong below the service.
+
+use crate::project::{JobId, ProjectId, ScanId, VersionNumber};
+
+/// A failure of the database or of the blob files.
+#[derive(Debug, thiserror::Error)]
+pub enum StorageError {
+    /// No such project, or it was deleted.
+    #[error("there is no project {0}")]
+    NoProject(ProjectId),
+    /// No such scan in the project, or it was deleted.
+    #[error("there is no scan {0}")]
+    NoScan(ScanId),
+    /// No such job.
+    #[error("there is no job {0}")]
+    NoJob(JobId),
+    /// The project has no version of this number.
+    #[error("project {0} has no version {1}")]
+    NoVersion(ProjectId, VersionNumber),
+    /// The job is in a final state already.
+    #[error("job {0} has ended")]
+    JobEnded(JobId),
+    /// The worker no longer holds what it tries to change: its lease ran out, the job was dismissed, or the
+    /// project is gone. Nothing was changed.
+    #[error("job {job} is no longer held in attempt {attempt}")]
+    Fenced {
+        /// The job.
+        job: JobId,
+        /// The attempt that was held.
+        attempt: u32,
+    },
+    /// A blob that a row names is not there.
+    #[error("blob {0} is missing")]
+    MissingBlob(String),
+    /// The bytes of a blob no longer have the hash that is their name.
+    #[error("blob {expected} is damaged: its bytes hash to {found}")]
+    DamagedBlob {
+        /// The name.
+        expected: String,
+        /// What the bytes hash to.
+        found: String,
+    },
+    /// A row holds a value that this program never writes.
+    #[error("the database holds an unreadable value in {column}: {value}")]
+    BadRow {
+        /// Table and column.
+        column: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// Another process serves this data directory.
+    #[error("the data directory is in use by another process")]
+    InUse,
+    /// The file system failed.
+    #[error("{action}: {source}")]
+    Io {
+        /// What was being done.
+        action: &'static str,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+    /// The database failed.
+    #[error("database: {0}")]
+    Database(#[from] sqlx::Error),
+    /// The database could not be brought to this program's schema.
+    #[error("migration: {0}")]
+    Migration(#[from] sqlx::migrate::MigrateError),
+}
+
+impl StorageError {
+    /// Wraps an I/O error with what was being done.
+    pub(super) fn io(action: &'static str) -> impl FnOnce(std::io::Error) -> Self {
+        move |source| Self::Io { action, source }
+    }
+}

@@ -1,0 +1,25 @@
+//! All state on disk: SQL rows ([`Store`]) and content-addressed files ([`BlobStore`]). Nothing else in the crate
+//! speaks SQL or opens files of the data directory.
+//!
+//! Uses [`crate::project`]; used by `jobs` and `http`. Every change of state is one short `BEGIN IMMEDIATE`
+//! transaction with `synchronous = FULL`: what was answered to a client survives a power cut.
+
+mod blobs;
+mod claims;
+mod derived;
+mod error;
+mod job_rows;
+mod projects;
+mod publication;
+mod rows;
+mod scans;
+mod store;
+mod versions;
+
+pub use blobs::{BlobId, BlobReader, BlobStore, BlobWriter, StoredBlob};
+pub use claims::{Claim, Lease, Measures};
+pub use error::StorageError;
+pub use job_rows::JobFilter;
+pub use publication::{NewVersion, Publication, ScanChange};
+pub use scans::{Admission, NewScan};
+pub use store::{Page, Store};

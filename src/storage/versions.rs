@@ -1,0 +1,89 @@
+//! Rows of model versions and of the pairs behind them.
+
+use sqlx::Row;
+use sqlx::sqlite::SqliteRow;
+
+use super::rows::{count, parsed};
+use super::{BlobId, Page, StorageError, Store};
+use crate::project::{ModelContent, ProjectId, Timestamp, Version, VersionNumber};
+
+impl Store {
+    /// One version.
+    pub async fn version(
+        &self,
+        project: ProjectId,
+        number: VersionNumber,
+    ) -> Result<(Version, String), StorageError> {
+        let row = sqlx::query("SELECT * FROM versions WHERE project_id = ? AND number = ?")
+            .bind(project.to_string())
+            .bind(number.0)
+            .fetch_optional(&self.read)
+            .await?
+            .ok_or(StorageError::NoVersion(project, number))?;
+        Ok((version(&row)?, row.try_get("engine")?))
+    }
+
+    /// What readers see of a version: of this one, or of the newest.
+    pub async fn content(
+        &self,
+        project: ProjectId,
+        number: Option<VersionNumber>,
+    ) -> Result<(VersionNumber, ModelContent), StorageError> {
+        let head = self.project(project).await?.head;
+        let number = number.unwrap_or(head);
+        if number == VersionNumber::EMPTY {
+            return Ok((number, ModelContent::default()));
+        }
+        let (version, _) = self.version(project, number).await?;
+        let (blobs, id) = (self.blobs.clone(), BlobId::parse(&version.content)?);
+        let read = move || {
+            let bytes = blobs.get(id)?;
+            serde_json::from_slice(&bytes).map_err(|e| StorageError::BadRow {
+                column: "the content of a version",
+                value: e.to_string(),
+            })
+        };
+        let content = tokio::task::spawn_blocking(read)
+            .await
+            .map_err(|e| StorageError::io("reading a version")(std::io::Error::other(e)))??;
+        Ok((number, content))
+    }
+
+    /// Versions of a project, oldest first.
+    pub async fn versions(&self, project: ProjectId, page: Page) -> Result<Vec<Version>, StorageError> {
+        let rows =
+            sqlx::query("SELECT * FROM versions WHERE project_id = ? AND number > ? ORDER BY number LIMIT ?")
+                .bind(project.to_string())
+                .bind(page.after.unwrap_or(0))
+                .bind(page.limit)
+                .fetch_all(&self.read)
+                .await?;
+        rows.iter().map(version).collect()
+    }
+
+    /// Results of all pairs of a project that were matched under these parameters, in order of their keys.
+    pub async fn pairs(&self, project: ProjectId, engine: &str) -> Result<Vec<Vec<u8>>, StorageError> {
+        let rows = sqlx::query("SELECT result FROM pairs WHERE project_id = ? AND engine = ? ORDER BY a, b")
+            .bind(project.to_string())
+            .bind(engine)
+            .fetch_all(&self.read)
+            .await?;
+        rows.iter().map(|row| Ok(row.try_get("result")?)).collect()
+    }
+}
+
+fn version(row: &SqliteRow) -> Result<Version, StorageError> {
+    Ok(Version {
+        project: parsed(row, "project_id")?,
+        number: VersionNumber(count(row, "number")?),
+        job: parsed(row, "job_id")?,
+        kind: parsed(row, "kind")?,
+        snapshot: row.try_get("snapshot")?,
+        content: row.try_get("content")?,
+        resolution: row.try_get("resolution")?,
+        components: count(row, "components")?,
+        registered: count(row, "registered")?,
+        waiting: count(row, "waiting")?,
+        created: Timestamp(row.try_get("created_ms")?),
+    })
+}

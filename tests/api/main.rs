@@ -1,0 +1,9 @@
+//! The REST interface, tried from outside: a real server on a real database, over real HTTP.
+
+mod bad_files;
+mod description;
+mod downloads;
+mod jobs;
+mod lifecycle;
+mod server;
+mod uploads;
