@@ -5,7 +5,7 @@ use crate::geometry::Pose;
 use crate::pairwise::{Logistic, centred_difference, shipped_verifier};
 
 /// Numbers that the second regression takes.
-pub const TRIPLET_FEATURES: usize = 4;
+pub const TRIPLET_FEATURES: usize = 5;
 /// What stands for the log-odds of a rival when there is none.
 const NO_RIVAL: f64 = -12.0;
 
@@ -39,19 +39,29 @@ impl Default for SupportOptions {
     }
 }
 
+/// What third scans say of one hypothesis.
+#[derive(Debug, Clone, Copy, Default)]
+struct Paths {
+    /// Sum over third scans of the likelihood of the best path that agrees.
+    agreeing: f64,
+    /// Sum over third scans of the likelihood of the best path, if it is better than the best that agrees: without it a pair that no
+    /// third scan can judge would look like one that all contradict.
+    opposing: f64,
+}
+
 /// (support, score with triplets) of each hypothesis of an edge, in the edge's order.
 pub(super) fn support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<(f64, f64)> {
     let supports = path_support(graph, edge, options);
     (0..edge.hypotheses.len())
         .map(|h| {
             let features = features_of(graph, edge, &supports, h, options);
-            (supports[h], options.triplet.logit(&features))
+            (supports[h].agreeing, options.triplet.logit(&features))
         })
         .collect()
 }
 
-/// The features of the second regression for each hypothesis of an edge: the pair's log-odds, log support, and the same of the best
-/// different pose of the pair.
+/// The features of the second regression for each hypothesis of an edge: the pair's log-odds, log support, the same of the best
+/// different pose of the pair, and log opposition.
 #[must_use]
 pub fn triplet_features(
     graph: &ScanGraph,
@@ -65,7 +75,7 @@ pub fn triplet_features(
 fn features_of(
     graph: &ScanGraph,
     edge: &Edge,
-    supports: &[f64],
+    supports: &[Paths],
     h: usize,
     options: &SupportOptions,
 ) -> [f64; TRIPLET_FEATURES] {
@@ -78,20 +88,20 @@ fn features_of(
             let differs =
                 angle > options.rival_angle || distance > options.rival_voxels * b.prepared.resolution;
             if differs {
-                rival = (rival.0.max(other.hypothesis.logit), rival.1.max(log(*support)));
+                rival = (rival.0.max(other.hypothesis.logit), rival.1.max(log(support.agreeing)));
             }
         }
     }
-    [me.logit, log(supports[h]), rival.0, rival.1]
+    [me.logit, log(supports[h].agreeing), rival.0, rival.1, log(supports[h].opposing)]
 }
 
 fn likelihood(h: &Supported) -> f64 {
     1.0 / (1.0 + (-h.hypothesis.logit).exp())
 }
 
-fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<f64> {
+fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<Paths> {
     let (a, b) = (edge.pair.a, edge.pair.b);
-    let mut supports = vec![0.0; edge.hypotheses.len()];
+    let mut supports = vec![Paths::default(); edge.hypotheses.len()];
     let Some(scan_b) = graph.scan(b) else { return supports };
     let reach = options.agree_voxels * scan_b.prepared.resolution;
     for k in graph.neighbors(a).filter(|k| *k != b) {
@@ -104,8 +114,10 @@ fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec
         };
         let (a_from_k, k_from_b) = (legs(first, k), legs(second, b));
         let mut best = vec![0.0_f64; supports.len()];
+        let mut most = 0.0_f64;
         for (a_from_k, p) in &a_from_k {
             for (k_from_b, q) in &k_from_b {
+                most = most.max(p * q);
                 let path = *a_from_k * *k_from_b;
                 let end = path.transform(&scan_b.centroid);
                 for (best, h) in best.iter_mut().zip(&edge.hypotheses) {
@@ -120,7 +132,10 @@ fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec
             }
         }
         for (total, best) in supports.iter_mut().zip(best) {
-            *total += best;
+            total.agreeing += best;
+            if best < most {
+                total.opposing += most;
+            }
         }
     }
     supports
