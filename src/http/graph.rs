@@ -10,7 +10,7 @@ use super::model::{ComponentBody, components};
 use super::problem::{Problem, Problems};
 use super::query::Params;
 use super::router::Api;
-use crate::project::{ProjectId, ScanId, ScanState, Standing, VersionNumber};
+use crate::project::{Edge, ProjectId, ScanId, ScanState, Standing, VersionNumber};
 
 /// A scan in the graph.
 #[derive(Debug, Serialize, ToSchema)]
@@ -40,6 +40,8 @@ pub(super) struct EdgeBody {
     inliers: usize,
     /// Overlap of the dense clouds under that motion, 0 to 1.
     overlap: f64,
+    /// Log-odds that the motion is right.
+    score: f64,
 }
 
 /// The scan graph of a version.
@@ -78,11 +80,12 @@ pub(super) async fn get_graph(
         let neighbours = place.map_or(0, |p| p.neighbours);
         NodeBody { scan: *scan, state, component: place.map(|p| p.component), neighbours }
     };
+    let edge = |e: &Edge| EdgeBody { a: e.a, b: e.b, inliers: e.inliers, overlap: e.overlap, score: e.score };
     let edges = content.edges.iter();
     Ok(Json(GraphBody {
         version,
         nodes: content.scans.iter().map(node).collect(),
-        edges: edges.map(|e| EdgeBody { a: e.a, b: e.b, inliers: e.inliers, overlap: e.overlap }).collect(),
+        edges: edges.map(edge).collect(),
         components: components(content.components),
     }))
 }

@@ -14,6 +14,7 @@ mod link;
 mod model;
 mod page;
 mod pose;
+mod preview;
 mod problem;
 mod project;
 mod query;

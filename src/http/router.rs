@@ -18,7 +18,7 @@ use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::{Problem, cloud, events, graph, health, job, model, page, pose, project, scan, upload};
+use super::{Problem, cloud, events, graph, health, job, model, page, pose, preview, project, scan, upload};
 use crate::jobs::{Exports, Intake};
 use crate::storage::Store;
 
@@ -71,6 +71,7 @@ fn routes() -> OpenApiRouter<Api> {
         .routes(routes!(pose::get_poses))
         .routes(routes!(cloud::get_cloud))
         .routes(routes!(graph::get_graph))
+        .routes(routes!(preview::get_preview))
         .routes(routes!(health::healthz))
         .routes(routes!(health::readyz))
         .routes(routes!(health::openapi))

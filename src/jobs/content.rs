@@ -6,8 +6,9 @@ use serde_json::Value;
 
 use super::parameters::content_key;
 use crate::cloud::ScanKey;
+use crate::graph::ScanGraph;
 use crate::mapping::{ModelSnapshot, ScanOutcome, WaitingReason};
-use crate::project::{Component, ContentKey, ModelContent, Placement, Reason, Scan, ScanId, Standing};
+use crate::project::{Component, ContentKey, Edge, ModelContent, Placement, Reason, Scan, ScanId, Standing};
 
 /// The content of a version in the ids that clients know, scans in order of arrival.
 pub(super) fn content_of(
@@ -42,6 +43,39 @@ pub(super) fn content_of(
         scans: scans.into_iter().map(|(s, standing)| (s.id, standing)).collect(),
         edges: Vec::new(),
     }
+}
+
+/// The verified edges between scans of one component, in order of arrival.
+pub(super) fn edges_of(
+    graph: &ScanGraph,
+    content: &ModelContent,
+    by_key: &HashMap<ContentKey, Scan>,
+) -> Vec<Edge> {
+    let component: HashMap<ScanId, usize> =
+        content.placed(None).map(|(scan, place)| (scan, place.component)).collect();
+    let mut edges: Vec<((u64, u64), Edge)> = graph
+        .edges()
+        .filter_map(|edge| {
+            let best = edge.hypotheses.first().filter(|h| h.score > 0.0)?;
+            let mut ends = [by_key.get(&content_key(edge.pair.a))?, by_key.get(&content_key(edge.pair.b))?];
+            ends.sort_by_key(|s| s.arrival);
+            let [a, b] = ends;
+            if component.get(&a.id)? != component.get(&b.id)? {
+                return None;
+            }
+            let evidence = &best.hypothesis.evidence;
+            let edge = Edge {
+                a: a.id,
+                b: b.id,
+                inliers: evidence.match_inliers as usize,
+                overlap: evidence.both().overlap(),
+                score: best.score,
+            };
+            Some(((a.arrival, b.arrival), edge))
+        })
+        .collect();
+    edges.sort_by_key(|(order, _)| *order);
+    edges.into_iter().map(|(_, edge)| edge).collect()
 }
 
 fn standing(outcome: &ScanOutcome) -> Standing {

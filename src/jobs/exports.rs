@@ -8,8 +8,9 @@ use std::sync::Arc;
 use tokio::sync::Mutex;
 
 use super::merge::Merge;
+use super::picture::draw;
 use super::{Compute, JobError, Panicked};
-use crate::cloud::PlyWriter;
+use crate::cloud::{ImageError, PlyWriter};
 use crate::project::{ModelContent, Placement, ProjectId, Scan};
 use crate::storage::{StorageError, Store, StoredBlob};
 
@@ -43,6 +44,9 @@ pub enum ExportError {
     /// The file could not be written.
     #[error("writing an export: {0}")]
     Io(#[from] io::Error),
+    /// The picture could not be encoded.
+    #[error(transparent)]
+    Picture(#[from] ImageError),
     /// A computation failed.
     #[error(transparent)]
     Panicked(#[from] Panicked),
@@ -83,6 +87,20 @@ impl Exports {
         let blobs = self.store.blobs.clone();
         let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
         self.made(key, move || blobs.put_with(|file| write_ply(file, &merge, request.voxel))).await
+    }
+
+    /// A picture of a version: PNG, the component from above and from the side.
+    pub async fn preview(
+        &self,
+        project: ProjectId,
+        content: &ModelContent,
+        component: ComponentChoice,
+    ) -> Result<StoredBlob, ExportError> {
+        let placed = self.placed(project, content, component).await?;
+        let key = key("preview", &placed);
+        let blobs = self.store.blobs.clone();
+        let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
+        self.made(key, move || Ok(blobs.put(&draw(&merge)?)?)).await
     }
 
     /// The remembered file, or the one that `make` makes.

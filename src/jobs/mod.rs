@@ -14,6 +14,7 @@ mod merge;
 mod model_cache;
 mod originals;
 mod parameters;
+mod picture;
 mod prepared;
 mod progress;
 mod refine;

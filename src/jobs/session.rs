@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::content::content_of;
+use super::content::{content_of, edges_of};
 use super::model_cache::ModelCache;
 use super::parameters::{Parameters, content_key, scan_key};
 use super::prepared::prepared;
@@ -195,7 +195,8 @@ impl Session {
                 let snapshot = model.snapshot();
                 let bytes = snapshot.to_bytes().map_err(|e| JobError::for_good("internal-error", e))?;
                 let stored = blobs.put(&bytes)?;
-                let content = content_of(&snapshot, &by_key, parameters.resolution);
+                let mut content = content_of(&snapshot, &by_key, parameters.resolution);
+                content.edges = edges_of(model.graph(), &content, &by_key);
                 let nothing = old.is_none() && content.scans.is_empty();
                 if nothing || old == Some(stored.id) {
                     return Ok((model, None, pairs));

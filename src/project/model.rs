@@ -69,6 +69,8 @@ pub struct Edge {
     pub inliers: usize,
     /// Overlap of the two dense clouds under the edge's motion, 0 to 1.
     pub overlap: f64,
+    /// Log-odds that the motion is right, by the pair's own evidence and that of third scans.
+    pub score: f64,
 }
 
 /// Everything that readers see of one version. Stored as a blob of JSON, never changed.

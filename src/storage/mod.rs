@@ -9,6 +9,8 @@ mod claims;
 mod derived;
 mod error;
 mod job_rows;
+#[cfg(test)]
+mod lease_tests;
 mod projects;
 mod publication;
 mod rows;

@@ -1,0 +1,41 @@
+//! `/v1/projects/{p}/preview`: a picture of the model.
+
+use axum::extract::State;
+use axum::http::HeaderMap;
+use axum::response::Response;
+
+use super::cloud::component;
+use super::download::{Bytes, Download, serve};
+use super::extract::Ids;
+use super::problem::{Problem, Problems};
+use super::query::Params;
+use super::router::Api;
+use crate::project::ProjectId;
+
+/// Downloads a picture of a component: from above and from the side, PNG.
+#[utoipa::path(get, path = "/v1/projects/{project}/preview", tag = "model", params(
+    ("project" = String, Path, description = "Id of the project"),
+    ("version" = Option<u32>, Query, description = "Number of the version; the newest if absent"),
+    ("component" = Option<String>, Query, description = "Index of a component, 0 (the largest) if absent, or `all`, each in its own frame"),
+    ("range" = Option<String>, Header, description = "One range of bytes"),
+    ("if-none-match" = Option<String>, Header, description = "ETags that the client holds")),
+    responses(
+    (status = 200, description = "The picture", body = Bytes, content_type = "image/png"),
+    (status = 206, description = "The range", body = Bytes, content_type = "image/png"),
+    (status = 304, description = "The client holds it already"),
+    (status = 416, description = "The range is outside the file", body = Problem, content_type = "application/problem+json"),
+    Problems))]
+pub(super) async fn get_preview(
+    State(api): State<Api>,
+    Ids(project): Ids<ProjectId>,
+    mut query: Params,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let version = query.version()?;
+    let component = component(&mut query)?;
+    query.finish()?;
+    let (version, content) = api.store.content(project, version).await?;
+    let blob = api.exports.preview(project, &content, component).await?;
+    let file_name = format!("preview-{version}.png");
+    serve(&api.store.blobs, Download { blob, media_type: "image/png", file_name }, &headers).await
+}
