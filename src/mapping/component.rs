@@ -1,6 +1,6 @@
 //! One rigid piece of the model.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
@@ -111,6 +111,25 @@ impl Component {
         {
             self.set_gauge(first);
         }
+    }
+
+    /// Takes these scans out as a component of their own, in the same frame until its gauge is set; tracks across are cut.
+    #[must_use]
+    pub fn split_off(&mut self, side: &BTreeSet<ScanKey>, options: &MappingOptions) -> Option<Self> {
+        let (theirs, mine): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            std::mem::take(&mut self.poses).into_iter().partition(|(key, _)| side.contains(key));
+        let tracks = std::mem::take(&mut self.tracks);
+        let part = |poses: BTreeMap<ScanKey, Pose>| -> Option<Self> {
+            let gauge = if poses.contains_key(&self.gauge) { self.gauge } else { *poses.keys().next()? };
+            let mut part = Self { gauge, tracks: tracks.restricted_to(&poses, options.track_length), poses };
+            part.set_gauge(gauge);
+            Some(part)
+        };
+        let (mine, theirs) = (part(mine), part(theirs));
+        if let Some(mine) = mine {
+            *self = mine;
+        }
+        theirs
     }
 
     /// Moves the component's frame so that `gauge` is at identity.

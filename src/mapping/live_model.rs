@@ -100,6 +100,7 @@ impl LiveModel {
         }
         let pairs = retrieve(&Retrieval::new(&next.graph), fresh, next.options.retrieved);
         next.try_pairs(&pairs, control)?;
+        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options);
         next.grow(control)?;
         *self = next;
         Ok(())

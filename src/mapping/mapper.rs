@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::candidates::{Candidate, best_candidate, support_of};
 use super::component::Component;
+use super::consistency::{supports, thrown, weakest_cut};
 use super::initial_pair::initial_pairs;
 use super::join::{Refusal, check_support, verify_join};
 use super::next_scan::visible_landmarks;
@@ -92,9 +93,13 @@ impl Mapper {
                     self.waiting.remove(&next.scan);
                     let component = &mut self.components[next.component];
                     component.absorb(single, &model_from_scan, graph, options);
-                    local_bundle_adjustment(component, next.scan, voxel, options, control)?;
                     let free = neighborhood(component, next.scan, options);
-                    dense(graph, component, Some(&free), voxel, control)?;
+                    guarded(graph, component, options, |component| {
+                        local_bundle_adjustment(component, next.scan, voxel, options, control)
+                    })?;
+                    guarded(graph, component, options, |component| {
+                        dense(graph, component, Some(&free), voxel, control).map(drop)
+                    })?;
                     self.joins_since_refinement += 1;
                     return Ok(Some(next.scan));
                 }
@@ -303,12 +308,36 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
         for component in &mut self.components {
-            pose_graph(graph, component, voxel, options, control)?;
-            dense(graph, component, None, voxel, control)?;
+            guarded(graph, component, options, |component| {
+                pose_graph(graph, component, voxel, options, control)
+            })?;
+            guarded(graph, component, options, |component| {
+                dense(graph, component, None, voxel, control).map(drop)
+            })?;
             component.tracks.filter(&component.poses, options.track_voxels * voxel, options.track_length);
         }
         self.joins_since_refinement = 0;
         Ok(())
+    }
+
+    /// Takes apart what hangs together by less than `least` support, so that it is decided anew with all evidence there is now.
+    /// What was joined leniently when little was known cannot poison the rest.
+    pub fn loosen(&mut self, graph: &ScanGraph, least: f64, options: &MappingOptions) {
+        let mut pending = std::mem::take(&mut self.components);
+        while let Some(mut component) = pending.pop() {
+            let supports = supports(graph, &component, options);
+            match weakest_cut(&component, &supports) {
+                Some((side, cut)) if cut < least => {
+                    pending.extend(component.split_off(&side, options));
+                    pending.push(component);
+                }
+                _ => self.components.push(component),
+            }
+        }
+        self.refused.clear();
+        self.filtered.clear();
+        self.dissolve_small();
+        self.sort_components();
     }
 
     /// Whether the model has grown enough since the last refinement to deserve another.
@@ -374,6 +403,21 @@ impl Mapper {
             self.add_waiting(scan);
         }
     }
+}
+
+/// Runs an adjustment and takes it back if it throws a scan off its edges.
+fn guarded(
+    graph: &ScanGraph,
+    component: &mut Component,
+    options: &MappingOptions,
+    adjust: impl FnOnce(&mut Component) -> Result<(), Cancelled>,
+) -> Result<(), Cancelled> {
+    let mut adjusted = component.clone();
+    adjust(&mut adjusted)?;
+    if thrown(graph, component, &adjusted, options).is_empty() {
+        *component = adjusted;
+    }
+    Ok(())
 }
 
 /// The refusal that says more: a violation or a rival over mere lack of support, and more support over less.

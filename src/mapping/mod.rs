@@ -8,6 +8,7 @@
 
 mod candidates;
 mod component;
+mod consistency;
 mod initial_pair;
 mod join;
 mod live_model;

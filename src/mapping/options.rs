@@ -28,6 +28,8 @@ pub struct MappingOptions {
     pub widening_rounds: usize,
     /// From strict to lenient. Below the last, scans wait.
     pub levels: Vec<JoinLevel>,
+    /// What holds together by less than this is taken apart and decided anew when scans arrive.
+    pub firm_support: f64,
     /// Share of the runner-up's support taken off a candidate's.
     pub rival_share: f64,
     /// Candidate poses agree within this angle …
@@ -63,6 +65,7 @@ impl Default for MappingOptions {
                 level(2.5, 0.15, 25),
                 level(1.5, 0.2, 12),
             ],
+            firm_support: 4.0,
             rival_share: 0.5,
             cluster_angle: 9.0_f64.to_radians(),
             cluster_voxels: 5.0,

@@ -192,6 +192,19 @@ impl Tracks {
         before - self.observations()
     }
 
+    /// The parts of the tracks that these scans see.
+    #[must_use]
+    pub fn restricted_to(&self, poses: &BTreeMap<ScanKey, Pose>, least: usize) -> Self {
+        let mut part = self.clone();
+        part.rebuild(|landmark| {
+            let observations: Vec<_> =
+                landmark.observations.iter().filter(|o| poses.contains_key(&o.scan)).copied().collect();
+            let position = aggregate(&observations, poses)?;
+            (observations.len() >= least).then_some(Landmark { position, observations })
+        });
+        part
+    }
+
     /// Takes over another component's tracks; call with poses that already hold its scans.
     pub fn absorb(&mut self, other: Self, poses: &BTreeMap<ScanKey, Pose>) {
         for landmark in other.landmarks.into_values() {

@@ -1,0 +1,170 @@
+//! How firmly the scans of a component hold together: the support that edges give to the poses as they are, the weakest cut through
+//! it, and which scans an adjustment threw off their edges.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::component::Component;
+use super::options::MappingOptions;
+use crate::cloud::ScanKey;
+use crate::geometry::Pose;
+use crate::graph::{Edge, ScanGraph, softplus};
+use crate::pairwise::centred_difference;
+
+/// An adjustment threw a scan when it keeps less than this share of its support …
+const KEPT_SHARE: f64 = 0.5;
+/// … and had at least this much to lose.
+const LEAST_LOSS: f64 = 2.0;
+
+/// The evidence of the best hypothesis of an edge that agrees with a pose of its scans.
+#[must_use]
+pub fn edge_support(graph: &ScanGraph, edge: &Edge, a_from_b: &Pose, options: &MappingOptions) -> f64 {
+    let Some(b) = graph.scan(edge.pair.b) else { return 0.0 };
+    let reach = options.cluster_voxels * b.prepared.resolution;
+    edge.hypotheses
+        .iter()
+        .filter(|h| {
+            let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, a_from_b, &b.centroid);
+            angle < options.cluster_angle && distance < reach
+        })
+        .map(|h| softplus(h.score))
+        .fold(0.0, f64::max)
+}
+
+/// Support between all pairs of a component's scans at its poses; pairs without any are left out.
+#[must_use]
+pub fn supports(
+    graph: &ScanGraph,
+    component: &Component,
+    options: &MappingOptions,
+) -> BTreeMap<(ScanKey, ScanKey), f64> {
+    let mut found = BTreeMap::new();
+    for (a, model_from_a) in &component.poses {
+        for b in graph.neighbors(*a).filter(|b| b > a) {
+            let (Some(model_from_b), Some(edge)) = (component.poses.get(&b), graph.edge(*a, b)) else {
+                continue;
+            };
+            let support = edge_support(graph, edge, &(model_from_a.inverse() * *model_from_b), options);
+            if support > 0.0 {
+                found.insert((*a, b), support);
+            }
+        }
+    }
+    found
+}
+
+/// Support of each scan: the sum over its pairs.
+#[must_use]
+pub fn support_by_scan(
+    graph: &ScanGraph,
+    component: &Component,
+    options: &MappingOptions,
+) -> BTreeMap<ScanKey, f64> {
+    let mut sums: BTreeMap<ScanKey, f64> = component.poses.keys().map(|key| (*key, 0.0)).collect();
+    for ((a, b), support) in supports(graph, component, options) {
+        *sums.entry(a).or_default() += support;
+        *sums.entry(b).or_default() += support;
+    }
+    sums
+}
+
+/// The scans that `after` holds much less firmly than `before`.
+#[must_use]
+pub fn thrown(
+    graph: &ScanGraph,
+    before: &Component,
+    after: &Component,
+    options: &MappingOptions,
+) -> Vec<ScanKey> {
+    let had = support_by_scan(graph, before, options);
+    let has = support_by_scan(graph, after, options);
+    had.into_iter()
+        .filter(|(key, had)| {
+            let has = has.get(key).copied().unwrap_or(0.0);
+            has < KEPT_SHARE * had && had - has > LEAST_LOSS
+        })
+        .map(|(key, _)| key)
+        .collect()
+}
+
+/// The weakest cut of a component: the side with fewer scans, and the support across (Stoer, Wagner: "A simple min-cut algorithm",
+/// JACM 1997). `None` for fewer than two scans.
+#[must_use]
+pub fn weakest_cut(
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+) -> Option<(BTreeSet<ScanKey>, f64)> {
+    let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
+    let index: BTreeMap<ScanKey, usize> = keys.iter().enumerate().map(|(i, key)| (*key, i)).collect();
+    let n = keys.len();
+    let mut weight = vec![vec![0.0_f64; n]; n];
+    for ((a, b), support) in supports {
+        if let (Some(&i), Some(&j)) = (index.get(a), index.get(b)) {
+            weight[i][j] += support;
+            weight[j][i] += support;
+        }
+    }
+    let mut groups: Vec<Vec<usize>> = (0..n).map(|i| vec![i]).collect();
+    let mut alive: Vec<usize> = (0..n).collect();
+    let mut best: Option<(Vec<usize>, f64)> = None;
+    while alive.len() > 1 {
+        let mut tied = vec![0.0_f64; n];
+        let mut left = alive.clone();
+        let mut last = (left[0], left[0]);
+        let mut cut = 0.0;
+        while !left.is_empty() {
+            let at =
+                (0..left.len()).max_by(|&x, &y| tied[left[x]].total_cmp(&tied[left[y]]).then(y.cmp(&x)))?;
+            let next = left.swap_remove(at);
+            left.sort_unstable();
+            last = (last.1, next);
+            cut = tied[next];
+            for &other in &left {
+                tied[other] += weight[next][other];
+            }
+        }
+        let (kept, merged) = last;
+        if best.as_ref().is_none_or(|(_, least)| cut < *least) {
+            best = Some((groups[merged].clone(), cut));
+        }
+        let moved = std::mem::take(&mut groups[merged]);
+        groups[kept].extend(moved);
+        for other in 0..n {
+            let extra = weight[merged][other];
+            weight[kept][other] += extra;
+            weight[other][kept] += extra;
+        }
+        weight[kept][kept] = 0.0;
+        alive.retain(|i| *i != merged);
+    }
+    let (side, cut) = best?;
+    let side: BTreeSet<ScanKey> = side.into_iter().map(|i| keys[i]).collect();
+    let side =
+        if 2 * side.len() > n { keys.into_iter().filter(|key| !side.contains(key)).collect() } else { side };
+    Some((side, cut))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mapping::tracks::Tracks;
+
+    #[test]
+    fn the_weakest_cut_is_found() {
+        let key = ScanKey;
+        let component = Component {
+            gauge: key(1),
+            poses: (1..=6).map(|k| (key(k), Pose::identity())).collect(),
+            tracks: Tracks::default(),
+        };
+        // Two triangles joined by a light edge and a lighter one.
+        let links =
+            [(1, 2, 5.0), (2, 3, 5.0), (1, 3, 5.0), (4, 5, 6.0), (5, 6, 6.0), (3, 4, 1.5), (2, 5, 0.5)];
+        let supports = links.iter().map(|&(a, b, w)| ((key(a), key(b)), w)).collect();
+        let (side, cut) = weakest_cut(&component, &supports).expect("six scans can be cut");
+        assert!((cut - 2.0).abs() < 1e-12);
+        assert!(
+            side == BTreeSet::from([key(1), key(2), key(3)])
+                || side == BTreeSet::from([key(4), key(5), key(6)])
+        );
+    }
+}
