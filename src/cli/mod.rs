@@ -1,6 +1,9 @@
-//! The command line: one file a subcommand.
+//! The command line: one file or folder a subcommand.
 
 pub mod evaluate;
 pub mod openapi;
+mod progress;
+pub mod register;
 pub mod serve;
+mod signals;
 pub mod simulate;

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use tokio_util::sync::CancellationToken;
 
+use super::signals::{INTERRUPTED, signal};
 use crate::config::Settings;
 use crate::{app, telemetry};
 
@@ -39,18 +40,5 @@ async fn stop_on_signal(stop: CancellationToken) {
     tracing::info!("stopping");
     stop.cancel();
     signal().await;
-    std::process::exit(130);
-}
-
-/// Returns at the next SIGINT or SIGTERM.
-async fn signal() {
-    use tokio::signal::unix::{SignalKind, signal};
-    let Ok(mut terminate) = signal(SignalKind::terminate()) else {
-        tracing::error!("SIGTERM cannot be listened for");
-        return std::future::pending().await;
-    };
-    tokio::select! {
-        _ = tokio::signal::ctrl_c() => {}
-        _ = terminate.recv() => {}
-    }
+    std::process::exit(INTERRUPTED.into());
 }

@@ -7,11 +7,13 @@
 mod canvas;
 mod glyphs;
 mod image;
+mod kept;
 mod palette;
 mod upright;
 mod view;
 
 pub use image::{Image, ImageError};
+pub use kept::PreviewScan;
 pub use palette::scan_color;
 
 use crate::geometry::{Point, Pose};
