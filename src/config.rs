@@ -179,7 +179,7 @@ mod tests {
         let config = flags.or(Settings::from_file(&path).unwrap()).resolve().unwrap();
         assert_eq!(config.workers.workers, 3);
         assert_eq!(config.listen, SocketAddr::from(([0, 0, 0, 0], 9000)));
-        assert_eq!(config.workers.lease, Duration::from_secs(60));
+        assert_eq!(config.workers.lease, Duration::from_mins(1));
     }
 
     #[test]

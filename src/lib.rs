@@ -5,6 +5,9 @@
 //! database, file, clock or global random source. The **service**, from [`project`] up, keeps projects of scans
 //! on disk, runs the core on them in jobs, and answers HTTP. `ARCHITECTURE.md` tells how the two meet.
 
+// What a stranger sends must not stop the service; tests may stop at the first surprise (`clippy.toml`).
+#![warn(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
 pub mod control;
 pub mod geometry;
 

@@ -21,10 +21,10 @@ const BENCHMARKS: [&str; 2] = ["3DMatch", "3DLoMatch"];
 /// belong to one estimate may be repeated with it, in the same order.
 #[derive(Debug, Clone, Args)]
 pub struct EvaluateArgs {
-    /// Estimated poses: {"scans": {name: {"pose": 4x4, "component": id}}} or {name: 4x4}.
+    /// Estimated poses: `{"scans": {name: {"pose": 4x4, "component": id}}}` or `{name: 4x4}`.
     #[arg(long, value_name = "poses.json", required = true)]
     pub estimate: Vec<PathBuf>,
-    /// Folder of a 3DMatch scene: 3DMatch_gt.log and .info, 3DLoMatch_gt.log and .info.
+    /// Folder of a 3DMatch scene: `3DMatch_gt.log` and `.info`, `3DLoMatch_gt.log` and `.info`.
     #[arg(long, value_name = "DIR")]
     pub scene: Vec<PathBuf>,
     /// Redwood log of true pairs, for a single estimate; with --gt-info. May be repeated.

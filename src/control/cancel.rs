@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 #[error("cancelled")]
 pub struct Cancelled;
 
-/// A clonable flag: all clones see a cancellation.
+/// A cloneable flag: all clones see a cancellation.
 #[derive(Debug, Clone, Default)]
 pub struct CancelToken(Arc<AtomicBool>);
 

@@ -92,7 +92,7 @@ pub struct TruthReport {
 }
 
 /// One scan with both its poses.
-struct Scan<'a> {
+struct PosedTwice<'a> {
     name: &'a str,
     truth_from_scan: Pose,
     model_from_scan: Pose,
@@ -102,10 +102,10 @@ struct Scan<'a> {
 /// count as not registered.
 #[must_use]
 pub fn against_truth(estimate: &Estimate, truth: &Estimate, tolerance: Tolerance) -> TruthReport {
-    let mut by_component: BTreeMap<&str, Vec<Scan<'_>>> = BTreeMap::new();
+    let mut by_component: BTreeMap<&str, Vec<PosedTwice<'_>>> = BTreeMap::new();
     for (name, scan) in &truth.placed {
         if let Some(placed) = estimate.find(name) {
-            by_component.entry(&placed.component).or_default().push(Scan {
+            by_component.entry(&placed.component).or_default().push(PosedTwice {
                 name,
                 truth_from_scan: scan.model_from_scan,
                 model_from_scan: placed.model_from_scan,
@@ -135,7 +135,7 @@ pub fn against_truth(estimate: &Estimate, truth: &Estimate, tolerance: Tolerance
     }
 }
 
-impl Scan<'_> {
+impl PosedTwice<'_> {
     /// Radians and metres; the distance is that of the two sensor positions.
     fn error(&self, truth_from_model: &Pose) -> (f64, f64) {
         self.truth_from_scan.difference(&(*truth_from_model * self.model_from_scan))
@@ -143,7 +143,7 @@ impl Scan<'_> {
 }
 
 /// The motion that lays most scans of a component on the truth.
-fn align(scans: &[Scan<'_>], tolerance: Tolerance) -> Pose {
+fn align(scans: &[PosedTwice<'_>], tolerance: Tolerance) -> Pose {
     // More right scans first; among equals, the smaller error of the right ones in units of the tolerance.
     let score = |truth_from_model: &Pose| {
         let (mut right, mut off) = (0usize, 0.0);
@@ -177,7 +177,7 @@ fn align(scans: &[Scan<'_>], tolerance: Tolerance) -> Pose {
 }
 
 /// The chordal mean of the rotations that take estimate to truth, and the translation that fits best under it.
-fn mean_motion<'a>(scans: impl Iterator<Item = &'a Scan<'a>> + Clone) -> Option<Pose> {
+fn mean_motion<'a>(scans: impl Iterator<Item = &'a PosedTwice<'a>> + Clone) -> Option<Pose> {
     let count = scans.clone().count() as f64;
     let sum: Matrix3<f64> = scans
         .clone()
@@ -194,7 +194,7 @@ fn mean_motion<'a>(scans: impl Iterator<Item = &'a Scan<'a>> + Clone) -> Option<
 
 fn component_report(
     component: &str,
-    scans: &[Scan<'_>],
+    scans: &[PosedTwice<'_>],
     errors: &[(f64, f64)],
     tolerance: Tolerance,
 ) -> ComponentReport {

@@ -70,10 +70,10 @@ mod tests {
     use crate::geometry::Pose;
     use nalgebra::{Rotation3, Vector3};
 
-    fn scans(poses: [Pose; 3], components: [&str; 3]) -> Estimate {
+    fn scans(poses: &[Pose; 3], components: [&str; 3]) -> Estimate {
         let mut estimate = Estimate::default();
         for ((name, model_from_scan), component) in ["a", "b", "c"].into_iter().zip(poses).zip(components) {
-            let placed = PlacedScan { model_from_scan, component: component.to_owned() };
+            let placed = PlacedScan { model_from_scan: *model_from_scan, component: component.to_owned() };
             estimate.placed.insert(name.to_owned(), placed);
         }
         estimate
@@ -85,14 +85,14 @@ mod tests {
 
     #[test]
     fn pairs_are_counted_below_each_threshold_and_unconnected_ones_fail() {
-        let truth = scans([Pose::identity(); 3], ["0"; 3]);
+        let truth = scans(&[Pose::identity(); 3], ["0"; 3]);
         let moved = Pose::new(Rotation3::new(Vector3::z() * 4f64.to_radians()), Vector3::new(0.0, 0.3, 0.0));
-        let estimate = scans([Pose::identity(), Pose::identity(), moved], ["0"; 3]);
+        let estimate = scans(&[Pose::identity(), Pose::identity(), moved], ["0"; 3]);
         let curves = ecdf(&estimate, &truth);
         assert_eq!((curves.pairs, curves.connected), (3, 3));
         assert_eq!(shares(&curves.rotation_deg), [1.0, 3.0, 3.0, 3.0, 3.0]);
         assert_eq!(shares(&curves.translation_m), [1.0, 1.0, 1.0, 3.0, 3.0]);
-        let mut split = scans([Pose::identity(), Pose::identity(), moved], ["0", "1", "0"]);
+        let mut split = scans(&[Pose::identity(), Pose::identity(), moved], ["0", "1", "0"]);
         assert_eq!(shares(&ecdf(&split, &truth).rotation_deg), [0.0, 1.0, 1.0, 1.0, 1.0]);
         split.placed.remove("c");
         assert_eq!(ecdf(&split, &truth).connected, 0);

@@ -94,6 +94,7 @@ impl ScanGraph {
     }
 
     /// All scans.
+    #[must_use]
     pub fn scans(&self) -> impl ExactSizeIterator<Item = &Arc<Scan>> {
         self.scans.values()
     }
@@ -105,6 +106,7 @@ impl ScanGraph {
     }
 
     /// All edges.
+    #[must_use]
     pub fn edges(&self) -> impl ExactSizeIterator<Item = &Edge> {
         self.edges.values()
     }

@@ -1,6 +1,7 @@
 //! `/v1/projects/{p}/poses`: poses as JSON or in the text forms of other programs.
 
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 
 use axum::Json;
 use axum::extract::State;
@@ -173,7 +174,7 @@ fn natural(name: &str) -> String {
             continue;
         }
         if !digits.is_empty() {
-            key.push_str(&format!("{:0>20}", digits.trim_start_matches('0')));
+            let _ = write!(key, "{:0>20}", digits.trim_start_matches('0'));
             digits.clear();
         }
         key.push(c);

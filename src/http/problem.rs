@@ -79,6 +79,7 @@ impl Problem {
     }
 
     /// Why a job failed, in the same form as every other error.
+    #[must_use]
     pub fn of_fault(fault: &Fault) -> Self {
         let status = match fault.code.as_str() {
             "unreadable-scan" | "unfit-scan" => StatusCode::UNPROCESSABLE_ENTITY,

@@ -24,7 +24,7 @@ pub(super) struct NewProject {
     name: String,
     /// Root of every random choice; at most 2^53 - 1.
     #[serde(default)]
-    #[schema(maximum = 9007199254740991_i64, required = false)]
+    #[schema(maximum = 9_007_199_254_740_991_i64, required = false)]
     seed: u64,
     /// Voxel size from which every length scale derives, metres. Chosen from the first scans if absent.
     #[schema(minimum = 0.00001, maximum = 100)]

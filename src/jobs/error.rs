@@ -30,12 +30,20 @@ pub enum JobError {
 impl JobError {
     /// A failure that every attempt would meet.
     #[must_use]
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "an error ends here, and `map_err` hands it over whole"
+    )]
     pub fn for_good(code: &str, detail: impl ToString) -> Self {
         Self::Failed { fault: Fault { code: code.to_owned(), detail: detail.to_string() }, retry: false }
     }
 
     /// A failure that may pass.
     #[must_use]
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "an error ends here, and `map_err` hands it over whole"
+    )]
     pub fn for_now(code: &str, detail: impl ToString) -> Self {
         Self::Failed { fault: Fault { code: code.to_owned(), detail: detail.to_string() }, retry: true }
     }

@@ -38,7 +38,7 @@ impl Observer for ProgressSink {
     fn progress(&self, progress: Progress) {
         let (stage, from, to) = band(self.kind, progress.stage);
         let done = progress.done.min(progress.total);
-        let part = if progress.total == 0 { 0 } else { (to - from) * done / progress.total };
+        let part = ((to - from) * done).checked_div(progress.total).unwrap_or(0);
         let percent = u8::try_from(from + part).unwrap_or(99).min(99);
         self.last.send_if_modified(|shown| {
             let next = Shown { stage: Some(stage), percent: shown.percent.max(percent) };

@@ -179,7 +179,7 @@ impl Pool {
         match ended {
             Ok(()) | Err(StorageError::Fenced { .. }) => {}
             Err(error) => {
-                tracing::error!(%error, "the end of a job could not be written; its lease will run out")
+                tracing::error!(%error, "the end of a job could not be written; its lease will run out");
             }
         }
     }

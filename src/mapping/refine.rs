@@ -255,7 +255,7 @@ pub fn dense(
             let before = surfaces.held_out_rms(&indexed.poses, gate);
             let after = surfaces.held_out_rms(&adjusted.poses, gate);
             write_back(component, &indexed.keys, &adjusted.poses);
-            let last = adjusted.rounds.last().map(|round| round.report.clone());
+            let last = adjusted.rounds.last().map(|round| round.report);
             Ok(Some(DenseOutcome { before, after, rounds: adjusted.rounds.len(), last }))
         }
         Err(DenseError::Minimise(MinimiseError::Cancelled(cancelled))) => Err(cancelled),

@@ -136,9 +136,11 @@ pub fn align(graph: &ScanGraph, a: &Component, b: &Component, a_from_b: &Pose, v
     pose
 }
 
+/// A point of b moved by the pose, the normal of its partner, and the distance between the two along it, in the frame of a.
+type Row = (Vector3<f64>, Vector3<f64>, f64);
+
 fn align_once(pairs: &[Crossing<'_>], pose: &Pose, gate: f64, kernel: f64, points: usize) -> Option<Pose> {
-    // (moved point, normal, residual), all in the frame of a.
-    let rows: Vec<Vec<(Vector3<f64>, Vector3<f64>, f64)>> = pairs
+    let rows: Vec<Vec<Row>> = pairs
         .par_iter()
         .map(|p| {
             let a_from_j = *pose * p.b_from_j;

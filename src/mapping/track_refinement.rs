@@ -49,7 +49,7 @@ impl<'s> Features<'s> {
         let at: Point = prepared.points[prepared.keypoints[keypoint as usize] as usize];
         let mut found = Vec::new();
         self.index.within(&at, PATCH_VOXELS * prepared.resolution as f32, |index, square| {
-            found.push((square, index))
+            found.push((square, index));
         });
         found.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
         found.into_iter().map(|(_, index)| index).collect()

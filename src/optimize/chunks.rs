@@ -22,7 +22,7 @@ mod tests {
     #[test]
     fn the_parts_cover_everything_once_and_in_order() {
         for len in [0, 1, LEAST, LEAST + 1, 100_003] {
-            let parts = map_parts(len, |range| range.collect::<Vec<_>>());
+            let parts = map_parts(len, Iterator::collect::<Vec<_>>);
             assert!(parts.len() <= MOST_PARTS);
             assert_eq!(parts.concat(), (0..len).collect::<Vec<_>>());
         }

@@ -65,7 +65,7 @@ pub fn consensus(a: &Scan, b: &Scan, matches: &[Match], options: &ConsensusOptio
 
     let mut covered = vec![false; matches.len()];
     let mut found: Vec<Consensus> = Vec::new();
-    for seed in graph.seed_order().into_iter() {
+    for seed in graph.seed_order() {
         if found.len() >= options.seeds {
             break;
         }

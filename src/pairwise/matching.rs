@@ -48,7 +48,7 @@ pub fn mutual_matches(a: &PreparedScan, b: &PreparedScan, limit: usize) -> Vec<M
         .map(|(row, &(best, second, column))| Match {
             a: row as u16,
             b: column as u16,
-            ambiguity: ratio(best, second) * ratio(by_column.best[column], by_column.second[column]),
+            ambiguity: ratio(best, second) * ratio(by_column.first[column], by_column.second[column]),
         })
         .collect();
     matches.sort_by(|x, y| x.ambiguity.total_cmp(&y.ambiguity).then(x.a.cmp(&y.a)));
@@ -62,6 +62,7 @@ fn ratio(best: f32, second: f32) -> f32 {
 }
 
 /// `block[i][j] = a_i . b_j` for `height` rows of `a`.
+#[expect(unsafe_code, reason = "the matrix product takes pointers; the lengths are asserted first")]
 fn similarities(a: &[f32], b: &[f32], height: usize, columns: usize, block: &mut [f32]) {
     assert!(a.len() >= height * DESCRIPTOR_LEN && b.len() >= columns * DESCRIPTOR_LEN);
     assert!(block.len() >= height * columns);
@@ -89,18 +90,18 @@ fn similarities(a: &[f32], b: &[f32], height: usize, columns: usize, block: &mut
 
 /// The two largest values of each column seen so far, and where the largest is.
 struct Best {
-    best: Vec<f32>,
+    first: Vec<f32>,
     second: Vec<f32>,
     index: Vec<u32>,
 }
 
 impl Best {
     fn new(columns: usize) -> Self {
-        Self { best: vec![-1.0; columns], second: vec![-1.0; columns], index: vec![0; columns] }
+        Self { first: vec![-1.0; columns], second: vec![-1.0; columns], index: vec![0; columns] }
     }
 
     fn update(&mut self, line: &[f32], row: u32) {
-        update_columns(line, row, &mut self.best, &mut self.second, &mut self.index);
+        update_columns(line, row, &mut self.first, &mut self.second, &mut self.index);
     }
 }
 
@@ -160,7 +161,7 @@ mod tests {
             }
             let mut sorted = a.clone();
             sorted.sort_by(|x, y| y.total_cmp(x));
-            prop_assert_eq!((best.best[0], best.second[0]), (sorted[0], sorted[1]));
+            prop_assert_eq!((best.first[0], best.second[0]), (sorted[0], sorted[1]));
             prop_assert_eq!(a[best.index[0] as usize], sorted[0]);
         }
     }

@@ -111,6 +111,7 @@ pub struct Verifier {
 
 /// The verifier that ships with the product.
 #[must_use]
+#[expect(clippy::expect_used, reason = "the weights are part of the binary, and a test reads them")]
 pub fn shipped_verifier() -> &'static Verifier {
     static SHIPPED: LazyLock<Verifier> = LazyLock::new(|| {
         serde_json::from_str(include_str!("verifier.json"))

@@ -256,7 +256,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let store = BlobStore::open(dir.path()).unwrap();
         let mut writer = store.writer().await.unwrap();
-        writer.write(&[1; 100_000]).await.unwrap();
+        writer.write(&vec![1; 100_000]).await.unwrap();
         drop(writer);
         assert_eq!(fs::read_dir(dir.path().join("partial")).unwrap().count(), 0);
     }

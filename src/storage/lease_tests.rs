@@ -10,7 +10,7 @@ use crate::project::{
     VersionNumber,
 };
 
-const LONG: Duration = Duration::from_secs(600);
+const LONG: Duration = Duration::from_mins(10);
 
 struct Fixture {
     store: Store,

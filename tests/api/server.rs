@@ -1,5 +1,6 @@
 //! A service for one test, and the few calls that most tests make.
 
+use std::fmt::Write as _;
 use std::time::Duration;
 
 use cairn::app::{Running, start};
@@ -140,7 +141,7 @@ pub fn room(shift: f64) -> Vec<u8> {
         points.len()
     );
     for [x, y, z] in points {
-        text += &format!("{:.4} {:.4} {:.4}\n", x - 2.0 - shift, y - 2.0 + 0.3 * shift, z - 1.3);
+        let _ = writeln!(text, "{:.4} {:.4} {:.4}", x - 2.0 - shift, y - 2.0 + 0.3 * shift, z - 1.3);
     }
     text.into_bytes()
 }

@@ -70,6 +70,8 @@ fn assign_roles(properties: &mut [Property]) -> Result<bool, DecodeError> {
 
 #[cfg(test)]
 mod tests {
+    use std::fmt::Write as _;
+
     use super::super::{DecodeError, DecodeOptions, Decoded, Format, decode};
     use crate::control::CancelToken;
 
@@ -122,7 +124,7 @@ mod tests {
     fn large_coordinates_keep_their_millimetres_beside_stray_zeros() {
         let mut rows = String::from("0 0 0\n");
         for i in 0..100 {
-            rows += &format!("{} {} {}\n", 501_234.0 + f64::from(i) * 0.001, 5_432_100.25, 120.5);
+            let _ = writeln!(rows, "{} {} {}", 501_234.0 + f64::from(i) * 0.001, 5_432_100.25, 120.5);
         }
         let header = "ply\nformat ascii 1.0\nelement vertex 101\nproperty double x\nproperty double y\n\
             property double z\nend_header\n";
