@@ -287,6 +287,13 @@ impl Store {
             }
             changed.push(id);
         }
+        // Members must never wait for a leader that nobody holds.
+        sqlx::query(
+            "UPDATE jobs SET leader = NULL WHERE leader IS NOT NULL AND NOT EXISTS
+               (SELECT 1 FROM jobs l WHERE l.id = jobs.leader AND l.worker IS NOT NULL)",
+        )
+        .execute(&mut *tx)
+        .await?;
         tx.commit().await?;
         let n = changed.len();
         self.announce(changed);

@@ -169,6 +169,20 @@ async fn dismissing_the_leader_frees_its_members() {
 }
 
 #[tokio::test]
+async fn deleting_the_scan_of_the_leader_frees_its_members() {
+    let f = Fixture::new().await;
+    let (a, b) = (f.ingested(1).await, f.ingested(2).await);
+    let both = f.claim(Lane::Map).await.unwrap();
+    let removal = f.store.delete_scan(f.project, a.scan.id).await.unwrap();
+    f.store.release(&both.lease).await.unwrap();
+    for expected in [b.job.id, removal.id] {
+        let claim = f.claim(Lane::Map).await.unwrap();
+        assert_eq!(claim.job.id, expected);
+        f.store.publish(&claim.lease, &f.ending(&claim)).await.unwrap();
+    }
+}
+
+#[tokio::test]
 async fn a_removal_comes_before_the_same_content_again_and_a_rebuild_after_all() {
     let f = Fixture::new().await;
     let scan = f.ingested(1).await;

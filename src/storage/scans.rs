@@ -150,6 +150,11 @@ impl Store {
         .bind(registration.to_string())
         .execute(&mut *tx)
         .await?;
+        // If it led a batch, the members are free again.
+        sqlx::query("UPDATE jobs SET leader = NULL WHERE leader = ?")
+            .bind(registration.to_string())
+            .execute(&mut *tx)
+            .await?;
         insert_job(&mut tx, job, project, Some(id), JobKind::Removal, Lane::Map, now).await?;
         tx.commit().await?;
         self.announce([registration, job]);
