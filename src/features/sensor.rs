@@ -74,7 +74,10 @@ pub fn viewpoint(
         }
     }
     match best {
-        Some(best) if best.hidden_share < CLEARLY_BETTER * first.hidden_share => best,
+        // A guessed direction orients normals, but is too vague to say what the sensor saw through.
+        Some(best) if best.hidden_share < CLEARLY_BETTER * first.hidden_share => {
+            Viewpoint { range_image: None, ..best }
+        }
         _ => first,
     }
 }

@@ -104,7 +104,9 @@ impl Pose {
     /// The rotation as a unit quaternion with w >= 0.
     #[must_use]
     pub fn quaternion(&self) -> UnitQuaternion<f64> {
-        let q = UnitQuaternion::from_rotation_matrix(&self.rotation);
+        // The conversion keeps the matrix's rounding errors as a length that is not one, and would let them grow.
+        let q =
+            UnitQuaternion::new_normalize(UnitQuaternion::from_rotation_matrix(&self.rotation).into_inner());
         if q.w < 0.0 { UnitQuaternion::new_unchecked(-q.into_inner()) } else { q }
     }
 
@@ -219,6 +221,17 @@ mod tests {
             let pose = Pose::new(Rotation3::new(Vector3::new(0.0, angle, 0.0)), Vector3::zeros());
             assert!((pose.angle() - angle).abs() < 1e-12, "{angle} came back as {}", pose.angle());
         }
+    }
+
+    #[test]
+    fn renormalising_again_and_again_stays_a_rotation() {
+        let step = Pose::new(Rotation3::new(Vector3::new(0.7, -0.2, 1.1)), Vector3::new(1.0, 0.0, 0.0));
+        let mut pose = step;
+        for _ in 0..10_000 {
+            pose = (step * pose.inverse() * step).renormalised();
+        }
+        let r = pose.rotation.matrix();
+        assert!((r.transpose() * r - Matrix3::identity()).amax() < 1e-14);
     }
 
     #[test]
