@@ -36,12 +36,6 @@ impl Component {
         self.poses.len()
     }
 
-    /// Whether no scan is left.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.poses.is_empty()
-    }
-
     /// Takes in another component at `self_from_other`, then links the matches of the edges between the two: tracks continue, are
     /// created and merge.
     pub fn absorb(

@@ -347,12 +347,6 @@ impl Mapper {
         self.joins_since_refinement >= options.refine_joins.max(grown)
     }
 
-    /// Whether anything was joined since the last refinement.
-    #[must_use]
-    pub fn joined_since_refinement(&self) -> bool {
-        self.joins_since_refinement > 0
-    }
-
     /// Largest components first, ties by gauge.
     pub fn sort_components(&mut self) {
         self.components.sort_by(|x, y| y.len().cmp(&x.len()).then(x.gauge.cmp(&y.gauge)));

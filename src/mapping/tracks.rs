@@ -100,6 +100,7 @@ pub fn aggregate_robustly(
 
 impl Tracks {
     /// The landmarks, in order of creation.
+    #[must_use]
     pub fn iter(&self) -> impl ExactSizeIterator<Item = &Landmark> {
         self.landmarks.values()
     }

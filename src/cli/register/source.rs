@@ -28,7 +28,7 @@ pub(super) enum Refusal {
 }
 
 impl Refusal {
-    fn unreadable(detail: impl ToString) -> Self {
+    fn unreadable(detail: &impl ToString) -> Self {
         Self::Failed(Failure { reason: "unreadable-scan", detail: detail.to_string() })
     }
 
@@ -45,14 +45,14 @@ impl From<DecodeError> for Refusal {
     fn from(error: DecodeError) -> Self {
         match error {
             DecodeError::Cancelled(cancelled) => Self::Cancelled(cancelled),
-            other => Self::unreadable(other),
+            other => Self::unreadable(&other),
         }
     }
 }
 
 impl From<io::Error> for Refusal {
     fn from(error: io::Error) -> Self {
-        Self::unreadable(error)
+        Self::unreadable(&error)
     }
 }
 
@@ -97,7 +97,7 @@ impl Source {
         if source.key == key {
             Ok(source)
         } else {
-            Err(Refusal::unreadable("the file changed while it was used"))
+            Err(Refusal::unreadable(&"the file changed while it was used"))
         }
     }
 
