@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use cairn::cli::{evaluate, openapi, register, serve, simulate};
+use cairn::cli::{demo, evaluate, openapi, register, serve, simulate};
 
 /// Fits many 3-D scans of one place into one model
 #[derive(Debug, Parser)]
@@ -18,15 +18,24 @@ struct Cli {
 enum Command {
     Serve(serve::ServeArgs),
     Register(register::RegisterArgs),
+    Demo(demo::DemoArgs),
     Evaluate(evaluate::EvaluateArgs),
     Simulate(simulate::SimulateArgs),
     Openapi(openapi::OpenapiArgs),
 }
 
-fn main() -> anyhow::Result<ExitCode> {
-    match Cli::parse().command {
+fn main() -> ExitCode {
+    run(Cli::parse().command).unwrap_or_else(|error| {
+        eprintln!("error: {error:#}");
+        ExitCode::FAILURE
+    })
+}
+
+fn run(command: Command) -> anyhow::Result<ExitCode> {
+    match command {
         Command::Serve(args) => serve::run(args)?,
         Command::Register(args) => return register::run(&args),
+        Command::Demo(args) => return demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args)?,
         Command::Simulate(args) => simulate::run(&args)?,
         Command::Openapi(args) => openapi::run(args)?,

@@ -16,7 +16,7 @@ const HEAD_BYTES: u64 = 16 * 1024;
 
 /// A file to register.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Input {
+pub(in crate::cli) struct Input {
     /// Its file name; where several files share it, with as many folders before it as tell them apart.
     pub name: String,
     /// Where it is.
@@ -25,7 +25,7 @@ pub(super) struct Input {
 
 /// What the arguments stand for.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Inputs {
+pub(in crate::cli) struct Inputs {
     /// Ascending by name.
     pub files: Vec<Input>,
     /// Files of folders that hold no scan, ascending.
@@ -37,7 +37,7 @@ pub(super) struct Inputs {
 ///
 /// # Errors
 /// Where a folder cannot be listed, is `out`, or there is no file at all.
-pub(super) fn gather(scans: &[PathBuf], out: &Path) -> anyhow::Result<Inputs> {
+pub(in crate::cli) fn gather(scans: &[PathBuf], out: &Path) -> anyhow::Result<Inputs> {
     let out = out.canonicalize().ok();
     let (mut paths, mut ignored) = (BTreeSet::new(), BTreeSet::new());
     for path in scans {

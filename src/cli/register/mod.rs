@@ -4,7 +4,7 @@
 //! a pose. Files are decoded three times (to measure, to prepare, to merge) rather than kept: memory holds the prepared
 //! scans and as many raw clouds as there are threads.
 
-mod inputs;
+pub(super) mod inputs;
 mod output;
 mod pipeline;
 mod poses;
