@@ -30,7 +30,8 @@ CREATE TABLE scans (
     scale           REAL,                    -- the resolution that suits it alone, metres
     job_id          TEXT NOT NULL,           -- the job that registers it
     created_ms      INTEGER NOT NULL,
-    deleted_ms      INTEGER                  -- set at once when a client deletes it
+    deleted_ms      INTEGER,                 -- set at once when a client deletes it
+    forgotten_ms    INTEGER                  -- set when the model holds it no more: its upload may go
 ) STRICT;
 
 -- The same content is one scan of a project, however often it is sent.
@@ -73,7 +74,7 @@ CREATE TABLE versions (
     number      INTEGER NOT NULL,
     job_id      TEXT NOT NULL,
     kind        TEXT NOT NULL,
-    snapshot    TEXT NOT NULL,               -- blob: the engine's state
+    snapshot    TEXT NOT NULL,               -- blob: the engine's state; kept for the newest version only
     content     TEXT NOT NULL,               -- blob: what readers see
     engine      TEXT NOT NULL,               -- parameters under which its scans were prepared and its pairs matched
     resolution  REAL NOT NULL,               -- metres
@@ -94,10 +95,44 @@ CREATE TABLE pairs (
     PRIMARY KEY (project_id, engine, a, b)
 ) STRICT, WITHOUT ROWID;
 
--- Blobs that can be computed again: prepared scans, merged clouds, pictures.
+-- Blobs that can be computed again: prepared scans, merged clouds, pictures. They go with whose they are; whoever
+-- else made use of one makes it again.
 CREATE TABLE derived (
     cache_key   TEXT PRIMARY KEY,            -- hash of kind, parameters and inputs
+    project_id  TEXT NOT NULL REFERENCES projects (id) ON DELETE CASCADE,
+    scan_id     TEXT REFERENCES scans (id) ON DELETE CASCADE,  -- NULL: made of several scans
     blob        TEXT NOT NULL,
     bytes       INTEGER NOT NULL,
     created_ms  INTEGER NOT NULL
 ) STRICT;
+
+-- Blobs that have lost a reference. The collector deletes the files of those that have no other.
+CREATE TABLE garbage (
+    blob        TEXT PRIMARY KEY
+) STRICT;
+
+CREATE INDEX scans_by_blob ON scans (blob);
+CREATE INDEX versions_by_snapshot ON versions (snapshot);
+CREATE INDEX versions_by_content ON versions (content);
+CREATE INDEX derived_by_blob ON derived (blob);
+CREATE INDEX derived_of_project ON derived (project_id, scan_id);
+CREATE INDEX derived_of_scan ON derived (scan_id);
+
+CREATE TRIGGER scan_forgotten AFTER UPDATE OF forgotten_ms ON scans BEGIN
+    INSERT OR IGNORE INTO garbage VALUES (old.blob);
+END;
+CREATE TRIGGER scan_gone AFTER DELETE ON scans BEGIN
+    INSERT OR IGNORE INTO garbage VALUES (old.blob);
+END;
+CREATE TRIGGER head_moved AFTER UPDATE OF head ON projects BEGIN
+    INSERT OR IGNORE INTO garbage SELECT snapshot FROM versions WHERE project_id = old.id AND number = old.head;
+END;
+CREATE TRIGGER version_gone AFTER DELETE ON versions BEGIN
+    INSERT OR IGNORE INTO garbage VALUES (old.snapshot), (old.content);
+END;
+CREATE TRIGGER derived_gone AFTER DELETE ON derived BEGIN
+    INSERT OR IGNORE INTO garbage VALUES (old.blob);
+END;
+CREATE TRIGGER derived_replaced AFTER UPDATE OF blob ON derived WHEN old.blob <> new.blob BEGIN
+    INSERT OR IGNORE INTO garbage VALUES (old.blob);
+END;

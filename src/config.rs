@@ -151,6 +151,7 @@ impl Settings {
                 progress_every: Duration::from_millis(250),
                 batch: within("batch", self.batch.unwrap_or(32).into(), 1, 1000)? as u32,
                 max_points: within("max-points", self.max_points.unwrap_or(200_000_000), 1, u32::MAX.into())?,
+                collect_every: Duration::from_secs(10),
                 grace: Duration::from_secs(20),
             },
             log_json: self.log_json.unwrap_or(false),

@@ -1,6 +1,7 @@
 //! Files that are made for download: merged clouds and pictures. Each is a pure function of a version and its
 //! parameters, built once and kept as a blob.
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::{self, BufWriter};
 use std::sync::Arc;
@@ -11,8 +12,8 @@ use super::merge::Merge;
 use super::picture::draw;
 use super::{Compute, JobError, Panicked};
 use crate::cloud::{ImageError, PlyWriter};
-use crate::project::{ModelContent, Placement, ProjectId, Scan};
-use crate::storage::{StorageError, Store, StoredBlob};
+use crate::project::{ModelContent, Placement, ProjectId, Scan, ScanId};
+use crate::storage::{FreshBlob, Owner, StorageError, Store, StoredBlob};
 
 /// Which part of a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -86,7 +87,7 @@ impl Exports {
         let key = key(&format!("cloud {:?}", request.voxel), &placed);
         let blobs = self.store.blobs.clone();
         let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
-        self.made(key, move || blobs.put_with(|file| write_ply(file, &merge, request.voxel))).await
+        self.made(project, key, move || blobs.put_with(|file| write_ply(file, &merge, request.voxel))).await
     }
 
     /// A picture of a version: PNG, the component from above and from the side.
@@ -100,14 +101,15 @@ impl Exports {
         let key = key("preview", &placed);
         let blobs = self.store.blobs.clone();
         let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
-        self.made(key, move || Ok(blobs.put(&draw(&merge)?)?)).await
+        self.made(project, key, move || Ok(blobs.put(&draw(&merge)?)?)).await
     }
 
     /// The remembered file, or the one that `make` makes.
     async fn made(
         &self,
+        project: ProjectId,
         key: blake3::Hash,
-        make: impl FnOnce() -> Result<StoredBlob, ExportError> + Send + 'static,
+        make: impl FnOnce() -> Result<FreshBlob, ExportError> + Send + 'static,
     ) -> Result<StoredBlob, ExportError> {
         if let Some(found) = self.store.derived(&key).await? {
             return Ok(found);
@@ -117,12 +119,12 @@ impl Exports {
         if let Some(found) = self.store.derived(&key).await? {
             return Ok(found);
         }
-        let stored = self.compute.run(make).await??;
-        self.store.remember(&key, stored).await?;
-        Ok(stored)
+        let fresh = self.compute.run(make).await??;
+        self.store.remember(&key, Owner { project, scan: None }, &fresh).await?;
+        Ok(*fresh)
     }
 
-    /// The scans that take part, in order of arrival.
+    /// The scans that take part, in order of arrival. Deleted ones do not: their uploads are gone.
     async fn placed(
         &self,
         project: ProjectId,
@@ -133,13 +135,12 @@ impl Exports {
             ComponentChoice::One(index) => Some(index),
             ComponentChoice::All => None,
         };
+        let mut places: HashMap<ScanId, &Placement> = content.placed(component).collect();
         let scans = self.store.scans_ever(project).await?;
         let placed: Vec<(Scan, Placement)> = scans
             .into_iter()
-            .filter_map(|(scan, _)| {
-                let place = content.placed(component).find(|(id, _)| *id == scan.id)?.1.clone();
-                Some((scan, place))
-            })
+            .filter(|(_, deleted)| !deleted)
+            .filter_map(|(scan, _)| places.remove(&scan.id).map(|place| (scan, place.clone())))
             .collect();
         if placed.is_empty() { Err(ExportError::NothingThere) } else { Ok(placed) }
     }

@@ -3,7 +3,7 @@
 use super::JobError;
 use super::originals::read_original;
 use super::parameters::Parameters;
-use super::prepared::make;
+use super::prepared::{make, remember};
 use super::session::Task;
 use crate::control::Stage;
 use crate::features::{extent, natural_resolution};
@@ -36,11 +36,12 @@ pub(super) async fn ingest(task: &Task) -> Result<(), JobError> {
     task.store.record_measures(lease, measures).await?;
     let project = task.store.project(scan.project).await?;
     let parameters = Parameters::choose(&task.store, &project).await?;
-    let key = parameters.prepared_key(scan.key);
     let blobs = task.store.blobs.clone();
-    let (_, stored) =
-        task.compute(move |control| make(&blobs, &scan, &original, parameters, control)).await??;
-    task.store.remember(&key, stored).await?;
+    let (_, fresh) = {
+        let scan = scan.clone();
+        task.compute(move |control| make(&blobs, &scan, &original, parameters, control)).await??
+    };
+    remember(task, &scan, parameters, &fresh).await?;
     Ok(task.store.finish_ingest(lease).await?)
 }
 

@@ -127,6 +127,7 @@ impl Intake {
             return Err(IntakeError::Empty);
         }
         let format = format.map_or_else(|| recognise(&head, &request.name), Ok)?;
+        // Pinned until the end of this function: the row comes last.
         let stored = writer.finish().await?;
         let key = content_key(ScanKey::of_hash(&stored.id.0, &request.interpretation.to_bytes()));
         let new = NewScan {

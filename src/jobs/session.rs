@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::content::{content_of, edges_of};
 use super::model_cache::ModelCache;
 use super::parameters::{Parameters, content_key, scan_key};
-use super::prepared::prepared;
+use super::prepared::prepare_all;
 use super::progress::ProgressSink;
 use super::workers::WorkerOptions;
 use super::{Compute, JobError, Panicked};
@@ -103,11 +103,10 @@ impl Session {
         let snapshot =
             ModelSnapshot::from_bytes(&bytes).map_err(|e| JobError::for_good("damaged-data", e))?;
         let by_key = self.scans_by_key(task).await?;
-        let mut scans = Vec::with_capacity(snapshot.scans.len());
-        for key in snapshot.scans.keys() {
-            let Some(scan) = by_key.get(&content_key(*key)) else { continue };
-            scans.push(prepared(task, scan, self.parameters).await?);
-        }
+        let known: Vec<Scan> =
+            snapshot.scans.keys().filter_map(|key| by_key.get(&content_key(*key)).cloned()).collect();
+        let scans = prepare_all(task, &known, self.parameters).await?;
+        let scans: Vec<Arc<PreparedScan>> = scans.into_iter().collect::<Result<_, JobError>>()?;
         let rows = task.store.pairs(self.project.id, &self.parameters.engine()).await?;
         let options = self.parameters.mapping_options();
         self.model = task
@@ -148,8 +147,9 @@ impl Session {
     /// Adds scans to the model. A scan that turns out unfit is left out and noted.
     pub async fn extend(&mut self, task: &Task, scans: Vec<Scan>) -> Result<(), JobError> {
         let mut fit: Vec<Arc<PreparedScan>> = Vec::with_capacity(scans.len());
-        for scan in scans {
-            match prepared(task, &scan, self.parameters).await {
+        let all = prepare_all(task, &scans, self.parameters).await?;
+        for (scan, prepared) in scans.iter().zip(all) {
+            match prepared {
                 Ok(prepared) => fit.push(prepared),
                 Err(JobError::Failed { fault, retry: false }) => self.unfit.push((scan.id, fault)),
                 Err(other) => return Err(other),
@@ -204,16 +204,15 @@ impl Session {
                 let bytes =
                     serde_json::to_vec(&content).map_err(|e| JobError::for_good("internal-error", e))?;
                 let readable = blobs.put(&bytes)?;
-                Ok((model, Some((stored.id, readable.id, content)), pairs))
+                Ok((model, Some((stored, readable, content)), pairs))
             })
             .await??
         };
         let from = self.project.head;
         let number = if written.is_some() { from.next() } else { from };
-        let (version, content) = match written {
-            Some((snapshot, readable, content)) => (Some(new_version(snapshot, readable, &content)), content),
-            None => (None, self.before.clone()),
-        };
+        // The fresh blobs live until the publication is committed.
+        let version = written.as_ref().map(|(s, readable, c)| new_version(s.id, readable.id, c));
+        let content = written.as_ref().map_or(&self.before, |(_, _, content)| content);
         let publication = Publication {
             project: self.project.id,
             kind: task.claim.job.kind,
@@ -221,8 +220,8 @@ impl Session {
             version,
             pairs,
             engine: parameters.engine(),
-            scans: changes(&self.before, &content, &self.unfit),
-            outcomes: task.claim.lease.all().map(|job| (job, outcome(&content, number, job))).collect(),
+            scans: changes(&self.before, content, &self.unfit),
+            outcomes: task.claim.lease.all().map(|job| (job, outcome(content, number, job))).collect(),
         };
         task.store.publish(&task.claim.lease, &publication).await?;
         task.models.put(self.project.id, number, model);

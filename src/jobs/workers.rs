@@ -35,6 +35,8 @@ pub struct WorkerOptions {
     pub batch: u32,
     /// Points that one scan may have.
     pub max_points: u64,
+    /// How often files are deleted that nothing needs any more.
+    pub collect_every: Duration,
     /// How long a stopping worker is waited for.
     pub grace: Duration,
 }
@@ -71,7 +73,9 @@ impl Workers {
             let pool = Arc::clone(&pool);
             loops.spawn(async move { pool.work(&format!("{}-{index}", std::process::id())).await });
         }
-        loops.spawn(async move { pool.sweep().await });
+        let sweeper = Arc::clone(&pool);
+        loops.spawn(async move { sweeper.sweep().await });
+        loops.spawn(async move { pool.collect().await });
         Ok(Self { stop, loops, grace })
     }
 
@@ -135,6 +139,22 @@ impl Pool {
                 Ok(0) => {}
                 Ok(jobs) => tracing::warn!(jobs, "leases ran out; the jobs are queued again"),
                 Err(error) => tracing::error!(%error, "leases cannot be checked"),
+            }
+        }
+    }
+
+    /// Deletes files that nothing needs any more, from time to time: nobody waits for it.
+    async fn collect(&self) {
+        let mut tick = tokio::time::interval(self.options.collect_every);
+        loop {
+            tokio::select! {
+                _ = tick.tick() => {}
+                () = self.stop.cancelled() => return,
+            }
+            match self.store.collect_garbage().await {
+                Ok(0) => {}
+                Ok(blobs) => tracing::info!(blobs, "files that nothing needs any more are deleted"),
+                Err(error) => tracing::error!(%error, "garbage cannot be collected"),
             }
         }
     }

@@ -1,7 +1,8 @@
 //! Files named by the BLAKE3 hash of their bytes: `blobs/ab/cd/abcd…`.
 //!
 //! A blob is written to a temporary file beside its final place, synced, renamed, and the folders are synced: once
-//! [`BlobWriter::finish`] returns, the bytes survive a power cut. Readers check the hash.
+//! [`BlobWriter::finish`] returns, the bytes survive a power cut. Readers check the hash. A blob whose row is not yet
+//! committed is pinned (see `pins`); which blobs are garbage is the rows' business (see `garbage`).
 
 use std::fmt;
 use std::fs::{self, File};
@@ -13,6 +14,7 @@ use tokio::io::AsyncWriteExt;
 use ulid::Ulid;
 
 use super::StorageError;
+use super::pins::{FreshBlob, Pin, Pins};
 
 /// The name of a blob: the hash of its bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -46,6 +48,7 @@ pub struct StoredBlob {
 #[derive(Debug, Clone)]
 pub struct BlobStore {
     root: Arc<Path>,
+    pins: Arc<Pins>,
 }
 
 impl BlobStore {
@@ -59,7 +62,7 @@ impl BlobStore {
             _ => {}
         }
         fs::create_dir_all(&partial).map_err(StorageError::io("making the folder of blobs"))?;
-        Ok(Self { root: root.into() })
+        Ok(Self { root: root.into(), pins: Arc::default() })
     }
 
     /// Where a blob is or would be.
@@ -85,7 +88,7 @@ impl BlobStore {
     }
 
     /// Stores bytes that are in memory. Blocks.
-    pub fn put(&self, bytes: &[u8]) -> Result<StoredBlob, StorageError> {
+    pub fn put(&self, bytes: &[u8]) -> Result<FreshBlob, StorageError> {
         self.put_with(|file| io::Write::write_all(file, bytes).map_err(StorageError::io("writing a blob")))
     }
 
@@ -93,7 +96,7 @@ impl BlobStore {
     pub fn put_with<E: From<StorageError>>(
         &self,
         write: impl FnOnce(&mut File) -> Result<(), E>,
-    ) -> Result<StoredBlob, E> {
+    ) -> Result<FreshBlob, E> {
         let path = self.temporary();
         let mut file = File::create_new(&path).map_err(StorageError::io("beginning a blob"))?;
         let partial = Partial { path, kept: false };
@@ -106,8 +109,8 @@ impl BlobStore {
         let bytes = io::copy(&mut io::BufReader::with_capacity(1 << 16, written), &mut hasher)
             .map_err(StorageError::io("reading a blob back"))?;
         let id = BlobId(hasher.finalize());
-        self.settle(partial, id)?;
-        Ok(StoredBlob { id, bytes })
+        let pin = self.settle(partial, id)?;
+        Ok(FreshBlob::new(StoredBlob { id, bytes }, pin))
     }
 
     /// Reads a whole blob into memory and checks it. Blocks.
@@ -132,9 +135,33 @@ impl BlobStore {
         self.root.join("partial").join(Ulid::generate().to_string())
     }
 
-    /// Moves a synced temporary file to its place and syncs the folders on the way. An equal blob that is there
-    /// already is replaced, which repairs it if it was damaged.
-    fn settle(&self, mut partial: Partial, id: BlobId) -> Result<(), StorageError> {
+    /// Deletes the files of those blobs that nobody has pinned; returns which. Blocks.
+    pub(super) fn remove_unpinned(&self, ids: &[BlobId]) -> Result<Vec<BlobId>, StorageError> {
+        let mut removed = Vec::with_capacity(ids.len());
+        for id in ids {
+            let pins = self.pins.lock();
+            if pins.holds(*id) {
+                continue;
+            }
+            match fs::remove_file(self.path(*id)) {
+                Err(e) if e.kind() != io::ErrorKind::NotFound => {
+                    return Err(StorageError::io("deleting a blob")(e));
+                }
+                _ => removed.push(*id),
+            }
+        }
+        Ok(removed)
+    }
+
+    /// Blobs whose pins went since the last call.
+    pub(super) fn take_released(&self) -> Vec<BlobId> {
+        self.pins.take_released()
+    }
+
+    /// Pins the blob, moves a synced temporary file to its place and syncs the folders on the way. An equal blob that
+    /// is there already is replaced, which repairs it if it was damaged.
+    fn settle(&self, mut partial: Partial, id: BlobId) -> Result<Pin, StorageError> {
+        let pin = Pin::new(&self.pins, id);
         let place = self.path(id);
         let folders: Vec<&Path> = place.ancestors().skip(1).take(3).collect();
         if let Some(inner) = folders.first() {
@@ -147,7 +174,7 @@ impl BlobStore {
                 .and_then(|folder| folder.sync_all())
                 .map_err(StorageError::io("syncing a folder of blobs"))?;
         }
-        Ok(())
+        Ok(pin)
     }
 }
 
@@ -192,15 +219,15 @@ impl BlobWriter {
     }
 
     /// Makes the blob safe: file and folders are synced when this returns.
-    pub async fn finish(mut self) -> Result<StoredBlob, StorageError> {
+    pub async fn finish(mut self) -> Result<FreshBlob, StorageError> {
         self.file.flush().await.map_err(StorageError::io("writing a blob"))?;
         self.file.sync_all().await.map_err(StorageError::io("syncing a blob"))?;
         let stored = StoredBlob { id: BlobId(self.hasher.finalize()), bytes: self.bytes };
         let Self { store, partial, .. } = self;
-        tokio::task::spawn_blocking(move || store.settle(partial, stored.id))
+        let pin = tokio::task::spawn_blocking(move || store.settle(partial, stored.id))
             .await
             .map_err(|e| StorageError::io("naming a blob")(io::Error::other(e)))??;
-        Ok(stored)
+        Ok(FreshBlob::new(stored, pin))
     }
 }
 
@@ -246,9 +273,9 @@ mod tests {
         writer.write(b"one ").await.unwrap();
         writer.write(b"two").await.unwrap();
         let stored = writer.finish().await.unwrap();
-        assert_eq!(stored, StoredBlob { id: BlobId(blake3::hash(b"one two")), bytes: 7 });
+        assert_eq!(*stored, StoredBlob { id: BlobId(blake3::hash(b"one two")), bytes: 7 });
         assert_eq!(store.get(stored.id).unwrap(), b"one two");
-        assert_eq!(store.put(b"one two").unwrap(), stored);
+        assert_eq!(*store.put(b"one two").unwrap(), *stored);
     }
 
     #[tokio::test]
@@ -270,6 +297,21 @@ mod tests {
         assert!(matches!(store.get(stored.id), Err(StorageError::DamagedBlob { .. })));
         store.put(b"precious").unwrap();
         assert_eq!(store.get(stored.id).unwrap(), b"precious");
+    }
+
+    #[test]
+    fn a_pinned_blob_is_not_removed_and_a_released_one_is_reported() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = BlobStore::open(dir.path()).unwrap();
+        let (first, second) = (store.put(b"needed").unwrap(), store.put(b"needed").unwrap());
+        let id = first.id;
+        drop(first);
+        assert_eq!((store.remove_unpinned(&[id]).unwrap(), store.take_released()), (vec![], vec![]));
+        drop(second);
+        assert_eq!(store.take_released(), [id]);
+        assert_eq!(store.remove_unpinned(&[id]).unwrap(), [id]);
+        assert!(!store.contains(id));
+        assert_eq!(store.remove_unpinned(&[id]).unwrap(), [id], "a file that is gone already is no error");
     }
 
     #[test]

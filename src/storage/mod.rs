@@ -8,9 +8,11 @@ mod blobs;
 mod claims;
 mod derived;
 mod error;
+mod garbage;
 mod job_rows;
 #[cfg(test)]
 mod lease_tests;
+mod pins;
 mod projects;
 mod publication;
 mod rows;
@@ -20,8 +22,10 @@ mod versions;
 
 pub use blobs::{BlobId, BlobReader, BlobStore, BlobWriter, StoredBlob};
 pub use claims::{Claim, Lease, Measures};
+pub use derived::Owner;
 pub use error::StorageError;
 pub use job_rows::JobFilter;
+pub use pins::FreshBlob;
 pub use publication::{NewVersion, Publication, ScanChange};
 pub use scans::{Admission, NewScan};
 pub use store::{Page, Store};

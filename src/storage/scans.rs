@@ -37,46 +37,46 @@ pub struct Admission {
     pub scan: Scan,
     /// The job that registers it.
     pub job: Job,
-    /// Whether the project had this content already; then nothing was changed.
+    /// Whether the project had this content already, registered or on its way; then nothing was changed.
     pub duplicate: bool,
 }
 
 impl Store {
     /// Acknowledges an upload: the scan and its job, in one transaction. Content that the project has already is
-    /// answered with the scan that it is.
+    /// answered with the scan that it is; if that has failed or was dismissed, a new job tries again.
     pub async fn admit_scan(&self, new: &NewScan) -> Result<Admission, StorageError> {
         let now = Timestamp::now();
         let mut tx = self.begin().await?;
         let project = new.project.to_string();
         let known = sqlx::query(
-            "SELECT id, job_id FROM scans WHERE project_id = ? AND content_key = ? AND deleted_ms IS NULL",
+            "SELECT id, job_id, state FROM scans WHERE project_id = ? AND content_key = ? AND deleted_ms IS NULL",
         )
         .bind(&project)
         .bind(new.key.0.to_be_bytes().as_slice())
         .fetch_optional(&mut *tx)
         .await?;
-        if let Some(row) = known {
-            let (scan, job) = (parsed(&row, "id")?, parsed(&row, "job_id")?);
-            drop(tx);
-            let (scan, job) = (self.scan(new.project, scan).await?, self.job(job).await?);
-            return Ok(Admission { scan, job, duplicate: true });
-        }
-        let arrival: i64 = sqlx::query(
-            "UPDATE projects SET arrivals = arrivals + 1 WHERE id = ? RETURNING arrivals - 1 AS arrival",
-        )
-        .bind(&project)
-        .fetch_optional(&mut *tx)
-        .await?
-        .ok_or(StorageError::NoProject(new.project))?
-        .try_get("arrival")?;
-        let (scan, job) = (ScanId::generate(), JobId::generate());
-        insert_scan(&mut tx, new, scan, job, arrival, now).await?;
-        insert_job(&mut tx, job, new.project, Some(scan), JobKind::Registration, Lane::Ingest, now).await?;
+        let (scan, job, duplicate) = match known {
+            Some(row) => {
+                let scan = parsed(&row, "id")?;
+                match word(&row, "state", ScanState::from_word)? {
+                    ScanState::Failed | ScanState::Dismissed => {
+                        (scan, try_again(&mut tx, new, scan, now).await?, false)
+                    }
+                    _ => (scan, parsed(&row, "job_id")?, true),
+                }
+            }
+            None => {
+                let (scan, job) = insert_scan(&mut tx, new, now).await?;
+                (scan, job, false)
+            }
+        };
         tx.commit().await?;
-        self.announce([job]);
-        self.ring();
+        if !duplicate {
+            self.announce([job]);
+            self.ring();
+        }
         let (scan, job) = (self.scan(new.project, scan).await?, self.job(job).await?);
-        Ok(Admission { scan, job, duplicate: false })
+        Ok(Admission { scan, job, duplicate })
     }
 
     /// One scan that was not deleted.
@@ -163,14 +163,21 @@ impl Store {
     }
 }
 
+/// A new scan and the job that registers it.
 async fn insert_scan(
     tx: &mut Transaction<'static, Sqlite>,
     new: &NewScan,
-    scan: ScanId,
-    job: JobId,
-    arrival: i64,
     now: Timestamp,
-) -> Result<(), StorageError> {
+) -> Result<(ScanId, JobId), StorageError> {
+    let arrival: i64 = sqlx::query(
+        "UPDATE projects SET arrivals = arrivals + 1 WHERE id = ? RETURNING arrivals - 1 AS arrival",
+    )
+    .bind(new.project.to_string())
+    .fetch_optional(&mut **tx)
+    .await?
+    .ok_or(StorageError::NoProject(new.project))?
+    .try_get("arrival")?;
+    let (scan, job) = (ScanId::generate(), JobId::generate());
     sqlx::query(
         "INSERT INTO scans (id, project_id, content_key, name, format, blob, bytes, interpretation, arrival, state,
            job_id, created_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, 'received', ?, ?)",
@@ -188,7 +195,26 @@ async fn insert_scan(
     .bind(now.0)
     .execute(&mut **tx)
     .await?;
-    Ok(())
+    insert_job(tx, job, new.project, Some(scan), JobKind::Registration, Lane::Ingest, now).await?;
+    Ok((scan, job))
+}
+
+/// A new job for a scan that never came into the model. The scan keeps its place in the order of arrival.
+async fn try_again(
+    tx: &mut Transaction<'static, Sqlite>,
+    new: &NewScan,
+    scan: ScanId,
+    now: Timestamp,
+) -> Result<JobId, StorageError> {
+    let job = JobId::generate();
+    sqlx::query("UPDATE scans SET state = 'received', standing = NULL, name = ?, job_id = ? WHERE id = ?")
+        .bind(new.name.as_str())
+        .bind(job.to_string())
+        .bind(scan.to_string())
+        .execute(&mut **tx)
+        .await?;
+    insert_job(tx, job, new.project, Some(scan), JobKind::Registration, Lane::Ingest, now).await?;
+    Ok(job)
 }
 
 /// Reads 16 bytes as a content key.
