@@ -14,11 +14,11 @@ use crate::project::ProjectId;
 
 /// Downloads the merged cloud as binary PLY: the uploads, moved into the frame of their component. Coordinates are metres
 /// in single precision; where they are as large as georeferenced ones, a comment in the header names the offset that was
-/// subtracted. Name a version to be sure that ranges belong to the same file.
+/// subtracted. Scans that were deleted since are left out. Name a version to be sure that ranges belong to the same file.
 #[utoipa::path(get, path = "/v1/projects/{project}/cloud", tag = "model", params(
     ("project" = String, Path, description = "Id of the project"),
     ("version" = Option<u32>, Query, description = "Number of the version; the newest if absent"),
-    ("component" = Option<String>, Query, description = "Index of a component, 0 (the largest) if absent, or `all`, each in its own frame"),
+    ("component" = Option<String>, Query, description = "Index of a component, 0 (the largest) if absent, or `all`: each stays in its own frame, so they lie over one another without any relation"),
     ("voxel" = Option<f64>, Query, description = "One point for each occupied cube of this edge, metres; every point if absent"),
     ("range" = Option<String>, Header, description = "One range of bytes"),
     ("if-none-match" = Option<String>, Header, description = "ETags that the client holds")),
@@ -27,6 +27,7 @@ use crate::project::ProjectId;
     (status = 206, description = "The range", body = Bytes, content_type = "model/ply"),
     (status = 304, description = "The client holds it already"),
     (status = 416, description = "The range is outside the file", body = Problem, content_type = "application/problem+json"),
+    (status = 422, description = "More cubes than `limit` are occupied", body = Problem, content_type = "application/problem+json"),
     Problems))]
 pub(super) async fn get_cloud(
     State(api): State<Api>,

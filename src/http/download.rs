@@ -1,6 +1,6 @@
 //! Files for download: strong ETags, conditional and partial requests (RFC 9110), streamed from the blob.
 
-use std::io::SeekFrom;
+use std::io::{ErrorKind, SeekFrom};
 
 use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -82,7 +82,11 @@ async fn body(
     length: u64,
     status: StatusCode,
 ) -> Result<Response, Problem> {
-    let mut file = tokio::fs::File::open(blobs.path(blob.id)).await.map_err(Problem::internal)?;
+    let mut file = tokio::fs::File::open(blobs.path(blob.id)).await.map_err(|error| match error.kind() {
+        // Its row was there a moment ago: whom it belongs to was deleted meanwhile.
+        ErrorKind::NotFound => Problem::not_found("the file was deleted"),
+        _ => Problem::internal(error),
+    })?;
     file.seek(SeekFrom::Start(first)).await.map_err(Problem::internal)?;
     let stream = ReaderStream::with_capacity(file.take(length), PIECE);
     let mut response = (status, Body::from_stream(stream)).into_response();

@@ -1,13 +1,18 @@
 //! `/v1/projects/{p}/poses`: poses as JSON or in the text forms of other programs.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write as _;
+use std::io;
 
 use axum::Json;
+use axum::body::Body;
 use axum::extract::State;
 use axum::http::{HeaderName, header};
 use axum::response::{IntoResponse, Response};
+use futures_util::Stream;
+use futures_util::stream::unfold;
 use serde::Serialize;
+use tokio::sync::mpsc;
 use utoipa::ToSchema;
 
 use super::extract::Ids;
@@ -105,9 +110,9 @@ pub(super) async fn get_poses(
             return Ok(([(HeaderName::from_static("cairn-version"), version.to_string())], Json(body))
                 .into_response());
         }
-        Form::Tum => to_tum(of(component.unwrap_or(0))),
-        Form::Kitti => to_kitti(of(component.unwrap_or(0)).map(|(_, pose)| pose)),
-        Form::Log => tokio::task::spawn_blocking(move || log(&scans)).await.map_err(Problem::internal)?,
+        Form::Tum => Body::from(to_tum(of(component.unwrap_or(0)))),
+        Form::Kitti => Body::from(to_kitti(of(component.unwrap_or(0)).map(|(_, pose)| pose))),
+        Form::Log => Body::from_stream(log(scans)),
     };
     let headers = [
         (header::CONTENT_TYPE, "text/plain; charset=utf-8".to_owned()),
@@ -123,9 +128,10 @@ async fn named(
     content: &ModelContent,
     component: Option<usize>,
 ) -> Result<Vec<Named>, Problem> {
+    let standings: HashMap<ScanId, &Standing> = content.scans.iter().map(|(id, s)| (*id, s)).collect();
     let mut scans = Vec::new();
     for (scan, _) in store.scans_ever(project).await? {
-        let place = match content.standing(scan.id) {
+        let place = match standings.get(&scan.id) {
             None => continue,
             Some(Standing::Registered(p)) => Some((p.component, p.model_from_scan)),
             Some(_) => None,
@@ -147,21 +153,38 @@ fn bodies(scans: Vec<Named>) -> BTreeMap<String, PoseBody> {
     bodies
 }
 
-/// Every pair of scans that share a component.
-fn log(scans: &[Named]) -> String {
-    let n = u32::try_from(scans.len()).unwrap_or(u32::MAX);
-    let numbered = || (0u32..).zip(scans).filter_map(|(i, s)| s.place.map(|(c, pose)| (i, c, pose)));
-    let mut entries = Vec::new();
-    for (i, component_i, model_from_i) in numbered() {
-        let others = numbered().filter(|(j, c, _)| *j > i && *c == component_i);
-        entries.extend(others.map(|(j, _, model_from_j)| LogEntry {
-            i,
-            j,
-            n,
-            i_from_j: model_from_i.inverse() * model_from_j,
-        }));
-    }
-    to_log(&entries)
+/// Pieces of a log that wait for a slow client, each of one scan with all later ones.
+const LOG_PIECES: usize = 4;
+
+/// Every pair of scans that share a component, written while it is sent: the text grows with the square of the scans.
+fn log(scans: Vec<Named>) -> impl Stream<Item = io::Result<String>> {
+    let (sender, receiver) = mpsc::channel(LOG_PIECES);
+    tokio::task::spawn_blocking(move || {
+        let pieces =
+            (0..scans.len()).map(|i| to_log(&entries_from(&scans, i))).filter(|text| !text.is_empty());
+        for piece in pieces {
+            // The client has gone if nobody receives.
+            if sender.blocking_send(Ok(piece)).is_err() {
+                return;
+            }
+        }
+    });
+    unfold(receiver, |mut receiver| async move { Some((receiver.recv().await?, receiver)) })
+}
+
+/// The pairs of scan `i` with the later scans of its component.
+fn entries_from(scans: &[Named], i: usize) -> Vec<LogEntry> {
+    let number = |i: usize| u32::try_from(i).unwrap_or(u32::MAX);
+    let Some((component, model_from_i)) = scans.get(i).and_then(|s| s.place) else { return Vec::new() };
+    let i_from_model = model_from_i.inverse();
+    let later = scans.iter().enumerate().skip(i + 1);
+    later
+        .filter_map(|(j, scan)| {
+            let (_, model_from_j) = scan.place.filter(|(c, _)| *c == component)?;
+            let i_from_j = i_from_model * model_from_j;
+            Some(LogEntry { i: number(i), j: number(j), n: number(scans.len()), i_from_j })
+        })
+        .collect()
 }
 
 /// A key by which `scan_10` sorts after `scan_9`: the name with its runs of digits padded.

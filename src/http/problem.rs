@@ -148,6 +148,11 @@ impl From<ExportError> for Problem {
     fn from(error: ExportError) -> Self {
         match error {
             ExportError::NothingThere => Self::not_found(error.to_string()),
+            ExportError::TooFine { limit, .. } => Self {
+                field: Some("voxel".to_owned()),
+                limit: Some(limit),
+                ..Self::new(StatusCode::UNPROCESSABLE_ENTITY, "too-fine", error.to_string())
+            },
             ExportError::Storage(error) => error.into(),
             other => Self::internal(other),
         }

@@ -25,12 +25,13 @@ pub(super) struct UploadBody {
     scan: ScanBody,
     /// The job that registers it.
     job: JobBody,
-    /// Whether the project had this content already; then nothing was changed.
+    /// Whether the project had this content already, registered or on its way; then nothing was changed.
     duplicate: bool,
 }
 
 /// Uploads a scan. It is acknowledged when its bytes are synced to disk; the job says what becomes of it. Content that
-/// the project has already is answered with the scan and job that it is (200).
+/// the project has already is answered with the scan and job that it is (200); if that scan has failed or was dismissed, a
+/// new job tries again (202).
 #[utoipa::path(post, path = "/v1/projects/{project}/scans", tag = "scans", params(
     ("project" = String, Path, description = "Id of the project"),
     ("name" = String, Query, description = "What to call the scan, such as its file name", min_length = 1, max_length = 200),

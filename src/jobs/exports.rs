@@ -39,6 +39,14 @@ pub enum ExportError {
     /// The version has no such component, or no registered scan at all.
     #[error("no scan is registered in this component of this version")]
     NothingThere,
+    /// So many cubes are occupied that they do not fit into memory.
+    #[error("more than {limit} cubes of {edge} m are occupied; take larger ones, or none")]
+    TooFine {
+        /// Edge of the cubes, metres.
+        edge: f64,
+        /// The limit.
+        limit: u64,
+    },
     /// State could not be read or written.
     #[error(transparent)]
     Storage(#[from] StorageError),

@@ -26,6 +26,9 @@ const GREY: [u8; 3] = [160; 3];
 /// Beyond this distance from zero single precision loses millimetres, and the file gets an offset, metres.
 const FAR: f64 = 5_000.0;
 
+/// Cubes that a thinned cloud may have: they are all in memory at once, about 100 bytes each.
+const MOST_CUBES: u64 = 16_000_000;
+
 /// Points of one cube.
 #[derive(Default)]
 struct Cell {
@@ -75,9 +78,13 @@ impl Merge {
     /// One point for each occupied cube of this edge (metres): the mean of the points in it, in the order of the cubes.
     pub fn thinned(&self, offset: &[f64; 3], edge: f64) -> Result<Vec<(Point, [u8; 3])>, ExportError> {
         let mut cells: HashMap<(usize, [i64; 3]), Cell> = HashMap::new();
+        let mut left = MOST_CUBES;
         self.visit(offset, |component, point, color| {
             let cube = (point / edge).map(|x| x.floor() as i64);
             let cell = cells.entry((component, cube.into())).or_default();
+            if cell.points == 0 {
+                left = left.checked_sub(1).ok_or(ExportError::TooFine { edge, limit: MOST_CUBES })?;
+            }
             cell.sum += point;
             cell.points += 1;
             for (sum, c) in cell.color.iter_mut().zip(color) {

@@ -1,6 +1,8 @@
 //! One join: a scan into a component, or a component into another. From the candidate pose through a fit to pooled matches and
 //! a dense alignment to the verdict on everything that overlaps.
 
+use serde::{Deserialize, Serialize};
+
 use nalgebra::Vector3;
 
 use super::candidates::{Candidate, support_of};
@@ -14,7 +16,7 @@ use crate::pairwise::inlier_matches;
 const FIT_ITERATIONS: usize = 5;
 
 /// Why a join was not made.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Refusal {
     /// Too little support, rivals aside.
     Support {

@@ -78,9 +78,10 @@ impl LiveModel {
         model.mapper.components = snapshot.components.iter().map(|c| c.component.clone()).collect();
         for (key, outcome) in &snapshot.scans {
             if matches!(outcome, ScanOutcome::Waiting(_)) {
-                model.mapper.add_waiting(*key);
+                model.mapper.waiting.insert(*key, snapshot.refusals.get(key).copied());
             }
         }
+        model.mapper.joins_since_refinement = snapshot.joins_since_refinement;
         Ok(model)
     }
 
@@ -167,7 +168,13 @@ impl LiveModel {
     /// The model as plain data.
     #[must_use]
     pub fn snapshot(&self) -> ModelSnapshot {
-        let mut snapshot = ModelSnapshot { resolution: self.voxel(), ..ModelSnapshot::default() };
+        let refusals = self.mapper.waiting.iter().filter_map(|(key, refusal)| Some((*key, (*refusal)?)));
+        let mut snapshot = ModelSnapshot {
+            resolution: self.voxel(),
+            refusals: refusals.collect(),
+            joins_since_refinement: self.mapper.joins_since_refinement,
+            ..ModelSnapshot::default()
+        };
         for (index, component) in self.mapper.components.iter().enumerate() {
             snapshot.components.push(ComponentSnapshot::of(component));
             for place in places(&self.graph, component, index) {

@@ -38,7 +38,8 @@ pub struct Mapper {
     refused: BTreeMap<(ScanKey, ScanKey), (f64, f64)>,
     /// How often each scan was filtered out, so that filtering ends.
     filtered: BTreeMap<ScanKey, usize>,
-    joins_since_refinement: usize,
+    /// Joins since the whole model was refined last.
+    pub joins_since_refinement: usize,
 }
 
 /// A scan is filtered at most this often while the model does not forget.

@@ -6,6 +6,7 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use super::component::Component;
+use super::join::Refusal;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 
@@ -118,6 +119,10 @@ pub struct ModelSnapshot {
     pub components: Vec<ComponentSnapshot>,
     /// Every scan of the model.
     pub scans: BTreeMap<ScanKey, ScanOutcome>,
+    /// Why waiting scans were refused, to go on from.
+    pub(super) refusals: BTreeMap<ScanKey, Refusal>,
+    /// Joins since the last refinement, to go on from.
+    pub(super) joins_since_refinement: usize,
 }
 
 impl ModelSnapshot {

@@ -43,7 +43,10 @@ impl Store {
                 .map_err(|e| StorageError::io("deleting blobs")(std::io::Error::other(e)))??;
             collected += removed.len();
             for id in settled.iter().chain(&removed) {
-                sqlx::query("DELETE FROM garbage WHERE blob = ?").bind(id.to_string()).execute(&mut *tx).await?;
+                sqlx::query("DELETE FROM garbage WHERE blob = ?")
+                    .bind(id.to_string())
+                    .execute(&mut *tx)
+                    .await?;
             }
             tx.commit().await?;
         }
@@ -64,5 +67,141 @@ impl Store {
         }
         tx.commit().await?;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use serde_json::json;
+
+    use super::*;
+    use crate::project::{
+        ContentKey, Interpretation, JobKind, Lane, Name, ProjectId, ProjectSettings, Scan, VersionNumber,
+    };
+    use crate::storage::{Claim, FreshBlob, NewScan, NewVersion, Owner, Publication};
+
+    struct Fixture {
+        store: Store,
+        _dir: tempfile::TempDir,
+    }
+
+    impl Fixture {
+        async fn new() -> Self {
+            let dir = tempfile::tempdir().unwrap();
+            Self { store: Store::open(dir.path()).await.unwrap(), _dir: dir }
+        }
+
+        async fn project(&self) -> ProjectId {
+            let name = Name::parse("test").unwrap();
+            self.store.create_project(&name, &ProjectSettings::default()).await.unwrap().id
+        }
+
+        fn blob(&self, text: &str) -> FreshBlob {
+            self.store.blobs.put(text.as_bytes()).unwrap()
+        }
+
+        async fn scan(&self, project: ProjectId, text: &str) -> Scan {
+            let blob = self.blob(text);
+            let new = NewScan {
+                project,
+                key: ContentKey(u128::from(blob.bytes)),
+                name: Name::parse("scan").unwrap(),
+                format: "ply".to_owned(),
+                blob: blob.id,
+                bytes: blob.bytes,
+                interpretation: Interpretation::default(),
+            };
+            self.store.admit_scan(&new).await.unwrap().scan
+        }
+
+        /// Collects, then says which of the texts are still there.
+        async fn left(&self, texts: &[&str]) -> Vec<bool> {
+            self.store.collect_garbage().await.unwrap();
+            let there = |text: &&str| self.store.blobs.contains(BlobId(blake3::hash(text.as_bytes())));
+            texts.iter().map(there).collect()
+        }
+
+        async fn claim(&self) -> Claim {
+            self.store.claim(Lane::Map, "worker", Duration::from_mins(1), 1).await.unwrap().unwrap()
+        }
+
+        async fn publish(&self, claim: &Claim, from: u32, version: Option<(&str, &str)>) {
+            let blobs = version.map(|(snapshot, content)| (self.blob(snapshot), self.blob(content)));
+            let version = blobs.as_ref().map(|(snapshot, content)| NewVersion {
+                snapshot: snapshot.id,
+                content: content.id,
+                resolution: 0.1,
+                components: 0,
+                registered: 0,
+                waiting: 0,
+            });
+            let publication = Publication {
+                project: claim.job.project,
+                kind: claim.job.kind,
+                from: VersionNumber(from),
+                version,
+                pairs: Vec::new(),
+                engine: "test".to_owned(),
+                scans: Vec::new(),
+                outcomes: vec![(claim.job.id, Ok(json!({})))],
+            };
+            self.store.publish(&claim.lease, &publication).await.unwrap();
+        }
+    }
+
+    #[tokio::test]
+    async fn what_a_deleted_project_alone_needed_goes_and_the_rest_stays() {
+        let f = Fixture::new().await;
+        let (doomed, other) = (f.project().await, f.project().await);
+        f.scan(doomed, "shared").await;
+        f.scan(other, "shared").await;
+        let scan = f.scan(doomed, "its own").await;
+        let prepared = f.blob("prepared");
+        let owner = Owner { project: doomed, scan: Some(scan.id) };
+        f.store.remember(&blake3::hash(b"key"), owner, &prepared).await.unwrap();
+        drop(prepared);
+        let texts = ["shared", "its own", "prepared"];
+        assert_eq!(f.left(&texts).await, [true, true, true]);
+        f.store.delete_project(doomed).await.unwrap();
+        assert_eq!(f.left(&texts).await, [true, false, false]);
+    }
+
+    #[tokio::test]
+    async fn an_upload_stays_until_the_model_holds_its_deleted_scan_no_more() {
+        let f = Fixture::new().await;
+        let project = f.project().await;
+        let scan = f.scan(project, "upload").await;
+        f.store.delete_scan(project, scan.id).await.unwrap();
+        assert_eq!(f.left(&["upload"]).await, [true]);
+        let removal = f.claim().await;
+        assert_eq!(removal.job.kind, JobKind::Removal);
+        f.publish(&removal, 0, None).await;
+        assert_eq!(f.left(&["upload"]).await, [false]);
+    }
+
+    #[tokio::test]
+    async fn only_the_newest_version_keeps_the_state_of_the_engine() {
+        let f = Fixture::new().await;
+        let project = f.project().await;
+        for from in 0..2 {
+            f.store.create_job(project, JobKind::Rebuild).await.unwrap();
+            let claim = f.claim().await;
+            let blobs = [["state 1", "content 1"], ["state 2", "content 2"]][from as usize];
+            f.publish(&claim, from, Some((blobs[0], blobs[1]))).await;
+        }
+        let texts = ["state 1", "content 1", "state 2", "content 2"];
+        assert_eq!(f.left(&texts).await, [false, true, true, true]);
+    }
+
+    #[tokio::test]
+    async fn a_fresh_blob_stays_while_its_row_is_to_come_and_goes_if_none_came() {
+        let f = Fixture::new().await;
+        let fresh = f.blob("fresh");
+        f.store.blobs.put(b"fresh").unwrap();
+        assert_eq!(f.left(&["fresh"]).await, [true]);
+        drop(fresh);
+        assert_eq!(f.left(&["fresh"]).await, [false]);
     }
 }

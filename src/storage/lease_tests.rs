@@ -247,3 +247,20 @@ async fn a_data_directory_serves_one_process_and_keeps_what_was_committed() {
     let page = Page { after: None, limit: 10 };
     assert!(store.jobs(project.id, JobFilter::default(), page).await.unwrap().is_empty());
 }
+
+#[tokio::test]
+async fn a_dismissed_scan_that_comes_again_gets_a_job_and_its_old_worker_changes_nothing() {
+    let f = Fixture::new().await;
+    let first = f.scan(1).await;
+    let old = f.claim(Lane::Ingest).await.unwrap();
+    f.store.dismiss_job(first.job.id).await.unwrap();
+    let again = f.scan(1).await;
+    assert_eq!(
+        (again.scan.id, again.scan.state, again.duplicate),
+        (first.scan.id, ScanState::Received, false)
+    );
+    assert!(matches!(f.store.finish_ingest(&old.lease).await, Err(StorageError::Fenced { .. })));
+    assert!(f.scan(1).await.duplicate, "it is on its way now");
+    let claim = f.claim(Lane::Ingest).await.unwrap();
+    assert_eq!((claim.job.id, claim.job.scan), (again.job.id, Some(first.scan.id)));
+}

@@ -5,5 +5,6 @@ mod description;
 mod downloads;
 mod jobs;
 mod lifecycle;
+mod restore;
 mod server;
 mod uploads;

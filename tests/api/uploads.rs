@@ -39,6 +39,24 @@ async fn an_upload_over_the_limit_is_refused_whether_it_says_so_or_not() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_scan_that_failed_is_tried_again_when_it_comes_again() {
+    let server = Server::start().await;
+    let project = server.project().await;
+    let bad = b"0 0 0\n1 0 0\n0 1 0\n1 1 0\n".to_vec();
+    let (first, job) = server.registered(&project, "four.xyz", bad.clone()).await;
+    assert_eq!(job["status"], "failed", "{job}");
+    let again = server.accepted(&project, "four%20again.xyz", bad).await;
+    assert_eq!((&again["scan"]["id"], &again["duplicate"]), (&first["id"], &Value::from(false)));
+    assert_eq!(again["scan"]["name"], "four again.xyz");
+    assert_ne!(again["job"]["id"], job["id"]);
+    assert_eq!(server.ended(&again["job"]).await["status"], "failed");
+    let list = server.json(&format!("{project}/scans")).await;
+    assert_eq!(list["items"].as_array().unwrap().len(), 1);
+    assert_eq!(list["items"][0]["state"], "failed");
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn the_same_content_is_one_scan_and_read_otherwise_it_is_another() {
     let server = Server::start().await;
     let project = server.project().await;
