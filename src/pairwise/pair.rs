@@ -86,6 +86,7 @@ pub fn match_pair(x: &Scan, y: &Scan) -> PairResult {
             consensus: candidate.score as f32,
             match_inliers: inlier_matches(a, b, &matches, &a_from_b).count() as u32,
             matches: matches.len() as u32,
+            range_images: [a, b].iter().filter(|scan| scan.prepared.range_image.is_some()).count() as u32,
         };
         let logit = shipped_verifier().pair.logit(&evidence.features(a.prepared.resolution));
         hypotheses.push(Hypothesis { a_from_b, evidence, logit });

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::dense::{Counts, share};
 
 /// Numbers that describe the evidence for a pose.
-pub const FEATURES: usize = 14;
+pub const FEATURES: usize = 15;
 
 /// Everything known about one hypothesis of a pair, as counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -25,6 +25,8 @@ pub struct Evidence {
     pub match_inliers: u32,
     /// Matches of the pair.
     pub matches: u32,
+    /// Of the two scans, how many say what their sensor saw: without that, no violation means nothing.
+    pub range_images: u32,
 }
 
 impl Evidence {
@@ -55,6 +57,7 @@ impl Evidence {
             share(both.inliers + both.on_seen_surface, both.points),
             share(both.violations, seen),
             self.b_on_a.overlap().max(self.a_on_b.overlap()),
+            f64::from(self.range_images),
         ]
     }
 }
@@ -154,6 +157,7 @@ mod tests {
             consensus: match_inliers as f32 * 0.6,
             match_inliers,
             matches: 300,
+            range_images: 2,
         };
         let logit = |e: Evidence| shipped_verifier().pair.logit(&e.features(0.05));
         assert!(logit(evidence(good, 120)) > 2.0);
