@@ -18,8 +18,8 @@ use crate::project::ProjectId;
 #[utoipa::path(get, path = "/v1/projects/{project}/cloud", tag = "model", params(
     ("project" = String, Path, description = "Id of the project"),
     ("version" = Option<u32>, Query, description = "Number of the version; the newest if absent"),
-    ("component" = Option<String>, Query, description = "Index of a component, 0 (the largest) if absent, or `all`: each stays in its own frame, so they lie over one another without any relation"),
-    ("voxel" = Option<f64>, Query, description = "One point for each occupied cube of this edge, metres; every point if absent"),
+    ("component" = Option<String>, Query, description = "Index of a component, 0 (the largest) if absent, or `all`: each stays in its own frame, so they lie over one another without any relation", pattern = "^(all|[0-9]{1,9})$"),
+    ("voxel" = Option<f64>, Query, description = "One point for each occupied cube of this edge, metres; every point if absent", minimum = 0.00001, maximum = 1000),
     ("range" = Option<String>, Header, description = "One range of bytes"),
     ("if-none-match" = Option<String>, Header, description = "ETags that the client holds")),
     responses(

@@ -24,7 +24,10 @@ use crate::storage::{JobFilter, Store};
 #[serde(deny_unknown_fields)]
 pub(super) struct NewJob {
     /// global-bundle-adjustment, track-refinement, dense-refinement or rebuild.
-    #[schema(examples("global-bundle-adjustment"))]
+    #[schema(
+        examples("global-bundle-adjustment"),
+        pattern = "^(global-bundle-adjustment|track-refinement|dense-refinement|rebuild)$"
+    )]
     kind: String,
 }
 
@@ -138,9 +141,11 @@ pub(super) async fn create_job(
 /// Lists the jobs of a project.
 #[utoipa::path(get, path = "/v1/projects/{project}/jobs", tag = "jobs", params(
     ("project" = String, Path, description = "Id of the project"),
-    ("status" = Option<String>, Query, description = "Only jobs with this status"),
-    ("kind" = Option<String>, Query, description = "Only jobs of this kind"),
-    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer"),
+    ("status" = Option<String>, Query, description = "Only jobs with this status",
+        pattern = "^(accepted|running|succeeded|failed|dismissed)$"),
+    ("kind" = Option<String>, Query, description = "Only jobs of this kind",
+        pattern = "^(registration|global-bundle-adjustment|track-refinement|dense-refinement|rebuild|removal)$"),
+    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer", pattern = "^[0-9a-f]{1,15}$"),
     ("limit" = Option<u32>, Query, description = "At most so many items, 1 to 200; 50 if absent", minimum = 1, maximum = 200)),
     responses((status = 200, description = "A part of the list", body = JobList), Problems))]
 pub(super) async fn list_jobs(
@@ -238,5 +243,20 @@ async fn settled(
         };
         // The end of the wait is seen at the next look.
         let _ = tokio::time::timeout_at(deadline, change).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_description_knows_every_word_that_is_understood() {
+        let yaml = crate::http::openapi_yaml().unwrap();
+        let choice = |words: Vec<&str>| format!("^({})$", words.join("|"));
+        let kinds = || JobKind::ALL.iter();
+        assert!(yaml.contains(&choice(JobState::ALL.iter().map(|s| s.as_str()).collect())));
+        assert!(yaml.contains(&choice(kinds().map(|k| k.as_str()).collect())));
+        assert!(yaml.contains(&choice(kinds().filter(|k| k.on_request()).map(|k| k.as_str()).collect())));
     }
 }

@@ -179,7 +179,7 @@ pub(super) async fn get_model(
 /// Lists the versions of a model.
 #[utoipa::path(get, path = "/v1/projects/{project}/versions", tag = "model", params(
     ("project" = String, Path, description = "Id of the project"),
-    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer"),
+    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer", pattern = "^[0-9a-f]{1,15}$"),
     ("limit" = Option<u32>, Query, description = "At most so many items, 1 to 200; 50 if absent", minimum = 1, maximum = 200)),
     responses((status = 200, description = "A part of the list", body = VersionList), Problems))]
 pub(super) async fn list_versions(

@@ -79,7 +79,8 @@ struct Named {
 /// share a component; its numbers count all scans of the version in the natural order of their names, from 0.
 #[utoipa::path(get, path = "/v1/projects/{project}/poses", tag = "model", params(
     ("project" = String, Path, description = "Id of the project"),
-    ("format" = Option<String>, Query, description = "json (if absent), tum, 3dmatch-log or kitti"),
+    ("format" = Option<String>, Query, description = "json (if absent), tum, 3dmatch-log or kitti",
+        pattern = "^(json|tum|3dmatch-log|kitti)$"),
     ("version" = Option<u32>, Query, description = "Number of the version; the newest if absent"),
     ("component" = Option<u32>, Query, description = "Only this component")),
     responses(

@@ -16,7 +16,7 @@ use crate::project::ProjectId;
 #[utoipa::path(get, path = "/v1/projects/{project}/preview", tag = "model", params(
     ("project" = String, Path, description = "Id of the project"),
     ("version" = Option<u32>, Query, description = "Number of the version; the newest if absent"),
-    ("component" = Option<String>, Query, description = "Index of a component, 0 (the largest) if absent, or `all`, each in its own frame"),
+    ("component" = Option<String>, Query, description = "Index of a component, 0 (the largest) if absent, or `all`, each in its own frame", pattern = "^(all|[0-9]{1,9})$"),
     ("range" = Option<String>, Header, description = "One range of bytes"),
     ("if-none-match" = Option<String>, Header, description = "ETags that the client holds")),
     responses(

@@ -110,7 +110,7 @@ pub(super) async fn create_project(
 
 /// Lists projects.
 #[utoipa::path(get, path = "/v1/projects", tag = "projects", params(
-    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer"),
+    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer", pattern = "^[0-9a-f]{1,15}$"),
     ("limit" = Option<u32>, Query, description = "At most so many items, 1 to 200; 50 if absent", minimum = 1, maximum = 200)),
     responses((status = 200, description = "A part of the list", body = ProjectList), Problems))]
 pub(super) async fn list_projects(

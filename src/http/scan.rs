@@ -124,7 +124,7 @@ pub(super) fn standing_body(standing: &Standing) -> Value {
 /// Lists the scans of a project.
 #[utoipa::path(get, path = "/v1/projects/{project}/scans", tag = "scans", params(
     ("project" = String, Path, description = "Id of the project"),
-    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer"),
+    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer", pattern = "^[0-9a-f]{1,15}$"),
     ("limit" = Option<u32>, Query, description = "At most so many items, 1 to 200; 50 if absent", minimum = 1, maximum = 200)),
     responses((status = 200, description = "A part of the list", body = ScanList), Problems))]
 pub(super) async fn list_scans(

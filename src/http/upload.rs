@@ -35,7 +35,7 @@ pub(super) struct UploadBody {
 #[utoipa::path(post, path = "/v1/projects/{project}/scans", tag = "scans", params(
     ("project" = String, Path, description = "Id of the project"),
     ("name" = String, Query, description = "What to call the scan, such as its file name", min_length = 1, max_length = 200),
-    ("units" = Option<String>, Query, description = "Unit of its coordinates: mm, cm, m, km, in, ft, us-ft, or metres in one unit; m if absent"),
+    ("units" = Option<String>, Query, description = "Unit of its coordinates: mm, cm, m, km, in, ft, us-ft, or metres in one unit; m if absent", min_length = 1),
     ("sensor_position" = Option<String>, Query, description = "Where the sensor stood, in the scan's own frame, metres: x,y,z")),
     request_body(content = Bytes, content_type = "application/octet-stream", description = "The file: PLY, PCD, XYZ or PTS"),
     responses(

@@ -55,20 +55,17 @@ impl Store {
         .bind(new.key.0.to_be_bytes().as_slice())
         .fetch_optional(&mut *tx)
         .await?;
-        let (scan, job, duplicate) = match known {
-            Some(row) => {
-                let scan = parsed(&row, "id")?;
-                match word(&row, "state", ScanState::from_word)? {
-                    ScanState::Failed | ScanState::Dismissed => {
-                        (scan, try_again(&mut tx, new, scan, now).await?, false)
-                    }
-                    _ => (scan, parsed(&row, "job_id")?, true),
+        let (scan, job, duplicate) = if let Some(row) = known {
+            let scan = parsed(&row, "id")?;
+            match word(&row, "state", ScanState::from_word)? {
+                ScanState::Failed | ScanState::Dismissed => {
+                    (scan, try_again(&mut tx, new, scan, now).await?, false)
                 }
+                _ => (scan, parsed(&row, "job_id")?, true),
             }
-            None => {
-                let (scan, job) = insert_scan(&mut tx, new, now).await?;
-                (scan, job, false)
-            }
+        } else {
+            let (scan, job) = insert_scan(&mut tx, new, now).await?;
+            (scan, job, false)
         };
         tx.commit().await?;
         if !duplicate {

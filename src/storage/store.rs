@@ -66,6 +66,10 @@ impl Store {
         sqlx::migrate!().run(&write).await?;
         let read =
             SqlitePoolOptions::new().max_connections(READERS).connect_with(options.read_only(true)).await?;
+        // The names of the database and of the folder of blobs must survive a power cut as well as what is in them.
+        File::open(data)
+            .and_then(|folder| folder.sync_all())
+            .map_err(StorageError::io("syncing the data directory"))?;
         let bells = Bells { changed: broadcast::Sender::new(CHANGES), work: Notify::new(), _lock: lock };
         Ok(Self { read, write, blobs, bells: Arc::new(bells) })
     }
