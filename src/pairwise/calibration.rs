@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use super::verifier::Logistic;
 
 const ITERATIONS: usize = 30;
-/// The penalty of `recipe` strength on every weight but the constant.
+/// The penalty on the square of every weight but the constant.
 const RIDGE: f64 = 3.0;
 
 /// One labelled example.

@@ -1,6 +1,6 @@
 //! How likely a pose of two scans is right: a logistic regression with quadratic terms on dense, free-space and match evidence.
 //!
-//! Its weights are fitted by `cairn calibrate` on scenes with known truth and shipped in `verifier.json`; every feature is
+//! Its weights are fitted (`calibration`) on scenes with known truth and shipped in `verifier.json`; every feature is
 //! free of units (counts, shares, or lengths in voxels).
 
 use std::sync::LazyLock;
