@@ -250,3 +250,9 @@ fn raw_depth_frames_register_whole() {
     let Some(data) = real_data() else { return };
     assert_registers_whole(&data.join("rgbd/redkitchen_30x20"), 0.2);
 }
+
+#[test]
+fn a_statue_registers_whole_without_a_flag() {
+    let Some(data) = real_data() else { return };
+    assert_registers_whole(&data.join("object/dragon_stand"), 0.02);
+}
