@@ -11,6 +11,7 @@ use super::next_scan::visible_landmarks;
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{dense, local_bundle_adjustment, neighborhood, pose_graph};
 use super::snapshot::WaitingReason;
+use super::surfaces::judge_inside;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
@@ -221,6 +222,7 @@ impl Mapper {
             if self.already_refused(link, candidate.support, level) {
                 continue;
             }
+            let level = &self.level_between(graph, a, b, level, options);
             match verify_join(
                 graph,
                 &self.components[a],
@@ -378,6 +380,23 @@ impl Mapper {
             }
             None => WaitingReason::NoVerifiedPair { tried, best_support: 0.0, needed },
         }
+    }
+
+    /// A level for joining two components: they may violate each other's free space little more than each violates its own, so clean
+    /// data, where wrong joins of alike rooms stand out, is judged more strictly than noisy data.
+    fn level_between(
+        &self,
+        graph: &ScanGraph,
+        a: usize,
+        b: usize,
+        level: &JoinLevel,
+        options: &MappingOptions,
+    ) -> JoinLevel {
+        let inside = judge_inside(graph, &self.components[a])
+            .plus(&judge_inside(graph, &self.components[b]))
+            .violation_share();
+        let usual = options.violation_contrast * inside + options.violation_floor;
+        JoinLevel { violation: level.violation.min(usual), ..*level }
     }
 
     fn larger_first(&self, i: usize, j: usize) -> (usize, usize) {

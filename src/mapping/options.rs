@@ -32,6 +32,10 @@ pub struct MappingOptions {
     pub firm_support: f64,
     /// Share of the runner-up's support taken off a candidate's.
     pub rival_share: f64,
+    /// Two components may violate each other's free space by this many times the share by which they violate their own …
+    pub violation_contrast: f64,
+    /// … and this share more.
+    pub violation_floor: f64,
     /// Candidate poses agree within this angle …
     pub cluster_angle: f64,
     /// … and this distance at the moved scan's centroid.
@@ -67,6 +71,8 @@ impl Default for MappingOptions {
             ],
             firm_support: 4.0,
             rival_share: 0.5,
+            violation_contrast: 3.0,
+            violation_floor: 0.01,
             cluster_angle: 9.0_f64.to_radians(),
             cluster_voxels: 5.0,
             rival_angle: 14.0_f64.to_radians(),

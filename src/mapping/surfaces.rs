@@ -24,6 +24,8 @@ const ALIGN_GATE_VOXELS: (f64, f64) = (4.0, 1.6);
 const ALIGN_KERNEL_VOXELS: f64 = 0.8;
 /// Points of a scan used to judge a join.
 const JUDGE_POINTS: usize = 1500;
+/// Points of a scan used to judge a component's own pairs.
+const INSIDE_POINTS: usize = 400;
 /// Scans whose centroids are farther apart than this many times their summed RMS radii share nothing.
 const NEAR_RADII: f64 = 2.5;
 
@@ -190,6 +192,31 @@ pub fn judge(graph: &ScanGraph, a: &Component, b: &Component, a_from_b: &Pose) -
             let i_from_j = p.a_from_i.inverse() * *a_from_b * p.b_from_j;
             let there = look(p.i, p.j, &i_from_j, stride(p.j, JUDGE_POINTS));
             there.plus(&look(p.j, p.i, &i_from_j.inverse(), stride(p.i, JUDGE_POINTS)))
+        })
+        .collect::<Vec<_>>()
+        .iter()
+        .fold(Counts::default(), |sum, counts| sum.plus(counts))
+}
+
+/// What all pairs of scans inside a component say of its poses: how much its own data violate free space where nothing is wrong.
+#[must_use]
+pub fn judge_inside(graph: &ScanGraph, component: &Component) -> Counts {
+    let members: Vec<(&Scan, Pose)> =
+        component.poses.iter().filter_map(|(key, pose)| Some((graph.scan(*key)?.as_ref(), *pose))).collect();
+    let pairs: Vec<(usize, usize)> =
+        (0..members.len()).flat_map(|i| (i + 1..members.len()).map(move |j| (i, j))).collect();
+    pairs
+        .par_iter()
+        .filter(|&&(i, j)| may_overlap(members[i].0, &members[i].1, members[j].0, &members[j].1))
+        .map(|&(i, j)| {
+            let ((x, x_pose), (y, y_pose)) = (&members[i], &members[j]);
+            let x_from_y = x_pose.inverse() * *y_pose;
+            look(x, y, &x_from_y, stride(y, INSIDE_POINTS)).plus(&look(
+                y,
+                x,
+                &x_from_y.inverse(),
+                stride(x, INSIDE_POINTS),
+            ))
         })
         .collect::<Vec<_>>()
         .iter()
