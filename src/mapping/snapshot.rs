@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use super::component::Component;
@@ -102,11 +101,6 @@ impl ComponentSnapshot {
             landmark_rms: (square / observations.max(1) as f64).sqrt(),
             component: component.clone(),
         }
-    }
-
-    /// The landmarks' positions in the component's frame, metres.
-    pub fn landmark_positions(&self) -> impl Iterator<Item = Vector3<f64>> + '_ {
-        self.component.tracks.iter().map(|landmark| landmark.position)
     }
 }
 
