@@ -9,4 +9,4 @@ mod support;
 pub use centrality::harmonic_centrality;
 pub use retrieval::{Retrieval, retrieve};
 pub use scan_graph::{Edge, ScanGraph, Supported, softplus};
-pub use support::{SupportOptions, TRIPLET_FEATURES, triplet_features};
+pub use support::{SupportOptions, triplet_features};

@@ -140,7 +140,7 @@ impl ScanGraph {
             .par_iter()
             .map(|(a, b)| {
                 control.check()?;
-                let result = match_pair(a, b);
+                let result = match_pair(a, b, &options.verifier);
                 let finished = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
                 control.report(Stage::Match, finished, fresh.len());
                 Ok(result)

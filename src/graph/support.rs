@@ -1,16 +1,16 @@
 //! What third scans say: a hypothesis i <- j is supported by every k for which some i <- k <- j leads to the same place.
 
+use std::sync::Arc;
+
 use super::scan_graph::{Edge, ScanGraph, Supported};
 use crate::geometry::Pose;
-use crate::pairwise::{Logistic, centred_difference, shipped_verifier};
+use crate::pairwise::{TRIPLET_FEATURES, Verifier, centred_difference, shipped_verifier};
 
-/// Numbers that the second regression takes.
-pub const TRIPLET_FEATURES: usize = 5;
 /// What stands for the log-odds of a rival when there is none.
 const NO_RIVAL: f64 = -12.0;
 
-/// When two motions agree, and when they are rivals. Angles in radians, distances in voxels at the moved scan's centroid.
-#[derive(Debug, Clone)]
+/// Who judges pairs, when two motions agree, and when they are rivals. Angles in radians, distances in voxels at the moved scan's centroid.
+#[derive(Debug, Clone, PartialEq)]
 pub struct SupportOptions {
     /// A path agrees with a hypothesis within this angle …
     pub agree_angle: f64,
@@ -22,8 +22,8 @@ pub struct SupportOptions {
     pub rival_voxels: f64,
     /// Hypotheses less likely than this are no part of a path.
     pub least_likelihood: f64,
-    /// The regression on the result, by default the shipped one.
-    pub triplet: Logistic,
+    /// The regressions on pairs and on the result, by default the shipped ones.
+    pub verifier: Arc<Verifier>,
 }
 
 impl Default for SupportOptions {
@@ -34,7 +34,7 @@ impl Default for SupportOptions {
             rival_angle: 14.0_f64.to_radians(),
             rival_voxels: 7.0,
             least_likelihood: 0.02,
-            triplet: shipped_verifier().triplet.clone(),
+            verifier: shipped_verifier(),
         }
     }
 }
@@ -55,7 +55,7 @@ pub(super) fn support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) 
     (0..edge.hypotheses.len())
         .map(|h| {
             let features = features_of(graph, edge, &supports, h, options);
-            (supports[h].agreeing, options.triplet.logit(&features))
+            (supports[h].agreeing, options.verifier.triplet.logit(&features))
         })
         .collect()
 }

@@ -15,7 +15,7 @@ use super::track_refinement::refine_tracks;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control, Stage};
 use crate::features::{PreparedScan, Scan};
-use crate::graph::{Retrieval, ScanGraph, SupportOptions, retrieve};
+use crate::graph::{Retrieval, ScanGraph, retrieve};
 use crate::optimize::Report;
 use crate::pairwise::{PairKey, PairResult};
 
@@ -74,7 +74,7 @@ impl LiveModel {
                 return Err(RestoreError::MissingScan(*key));
             }
         }
-        model.graph.add_results(pairs, &SupportOptions::default());
+        model.graph.add_results(pairs, &model.options.support);
         model.mapper.components = snapshot.components.iter().map(|c| c.component.clone()).collect();
         for (key, outcome) in &snapshot.scans {
             if matches!(outcome, ScanOutcome::Waiting(_)) {
@@ -111,7 +111,7 @@ impl LiveModel {
     pub fn remove(&mut self, key: ScanKey) -> bool {
         self.mapper.remove(key, &self.options);
         self.new_pairs.retain(|p| p.pair.a != key && p.pair.b != key);
-        let there = self.graph.remove_scan(key, &SupportOptions::default());
+        let there = self.graph.remove_scan(key, &self.options.support);
         self.mapper.sort_components();
         there
     }
@@ -193,7 +193,7 @@ impl LiveModel {
     }
 
     fn try_pairs(&mut self, pairs: &BTreeSet<PairKey>, control: Control<'_>) -> Result<(), Cancelled> {
-        self.new_pairs.extend(self.graph.try_pairs(pairs, &SupportOptions::default(), control)?);
+        self.new_pairs.extend(self.graph.try_pairs(pairs, &self.options.support, control)?);
         Ok(())
     }
 

@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::control::Seed;
+use crate::graph::SupportOptions;
 
 /// What a join must show. Tried from the strictest down; after every join the strictest comes first again.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -22,6 +23,9 @@ pub struct JoinLevel {
 pub struct MappingOptions {
     /// Root of the random choices.
     pub seed: Seed,
+    /// How pairs are judged. Not stored: a stored project keeps to the shipped verifier.
+    #[serde(skip)]
+    pub support: SupportOptions,
     /// Pairs retrieved for each scan.
     pub retrieved: usize,
     /// Rounds of widening for scans and components that stay apart, each trying as many pairs again.
@@ -61,6 +65,7 @@ impl Default for MappingOptions {
         let level = |support, violation, initial_matches| JoinLevel { support, violation, initial_matches };
         Self {
             seed: Seed(0),
+            support: SupportOptions::default(),
             retrieved: 20,
             widening_rounds: 6,
             levels: vec![

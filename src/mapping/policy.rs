@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 use super::mapper::Mapper;
 use super::options::MappingOptions;
 use crate::control::{Cancelled, Control, Stage};
-use crate::graph::{ScanGraph, SupportOptions};
+use crate::graph::ScanGraph;
 use crate::pairwise::PairResult;
 
 /// Grows the model until nothing more fits. `pairs` collects the results of pairs that widening tried.
@@ -22,7 +22,6 @@ pub fn grow(
     pairs: &mut Vec<PairResult>,
     control: Control<'_>,
 ) -> Result<(), Cancelled> {
-    let support = SupportOptions::default();
     let mut rounds = 0;
     loop {
         join_all(mapper, graph, voxel, options, control)?;
@@ -35,7 +34,7 @@ pub fn grow(
             break;
         }
         rounds += 1;
-        pairs.extend(graph.try_pairs(&fresh, &support, control)?);
+        pairs.extend(graph.try_pairs(&fresh, &options.support, control)?);
     }
     if mapper.refinement_is_due(options) {
         mapper.refine(graph, voxel, options, control)?;

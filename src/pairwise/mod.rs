@@ -14,4 +14,6 @@ pub use dense::{Counts, look, quick_overlap};
 pub use icp::{icp, perturbed_about};
 pub use matching::{Match, mutual_matches};
 pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};
-pub use verifier::{Evidence, FEATURES, Logistic, Verifier, shipped_verifier};
+pub use verifier::{
+    Evidence, FEATURES, Logistic, TRIPLET_FEATURES, Verifier, VerifierError, shipped_verifier,
+};

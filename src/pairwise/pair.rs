@@ -6,7 +6,7 @@ use super::consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, centred_diffe
 use super::dense::{look, quick_overlap};
 use super::icp::icp;
 use super::matching::mutual_matches;
-use super::verifier::{Evidence, shipped_verifier};
+use super::verifier::{Evidence, Verifier};
 use crate::cloud::ScanKey;
 use crate::features::Scan;
 use crate::geometry::Pose;
@@ -45,7 +45,7 @@ pub struct Hypothesis {
     pub logit: f64,
 }
 
-/// Matches and verified hypotheses of one pair: a pure function of two prepared scans.
+/// Matches and verified hypotheses of one pair: a pure function of two prepared scans and a verifier.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PairResult {
     /// Which pair.
@@ -58,7 +58,7 @@ pub struct PairResult {
 
 /// Matches and verifies one pair. `x` and `y` may come in either order and must be different scans at one resolution.
 #[must_use]
-pub fn match_pair(x: &Scan, y: &Scan) -> PairResult {
+pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
     let (a, b) = if x.key() < y.key() { (x, y) } else { (y, x) };
     let pair = PairKey { a: a.key(), b: b.key() };
     let matches = mutual_matches(&a.prepared, &b.prepared, MAX_MATCHES);
@@ -88,7 +88,7 @@ pub fn match_pair(x: &Scan, y: &Scan) -> PairResult {
             matches: matches.len() as u32,
             range_images: [a, b].iter().filter(|scan| scan.prepared.range_image.is_some()).count() as u32,
         };
-        let logit = shipped_verifier().pair.logit(&evidence.features(a.prepared.resolution));
+        let logit = verifier.pair.logit(&evidence.features(a.prepared.resolution));
         hypotheses.push(Hypothesis { a_from_b, evidence, logit });
     }
     hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));

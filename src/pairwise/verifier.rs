@@ -3,7 +3,7 @@
 //! Its weights are fitted (`calibration`) on scenes with known truth and shipped in `verifier.json`; every feature is
 //! free of units (counts, shares, or lengths in voxels).
 
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 
 use serde::{Deserialize, Serialize};
 
@@ -11,6 +11,8 @@ use super::dense::{Counts, share};
 
 /// Numbers that describe the evidence for a pose.
 pub const FEATURES: usize = 15;
+/// Numbers that the second regression takes: what the first one says, and what third scans do (`graph::triplet_features`).
+pub const TRIPLET_FEATURES: usize = 5;
 
 /// Everything known about one hypothesis of a pair, as counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -94,6 +96,14 @@ impl Logistic {
         terms
     }
 
+    /// Whether there is a weight for each term of `features` numbers, and all can be computed with.
+    fn fits(&self, features: usize) -> bool {
+        let terms = 1 + features * (features + 3) / 2;
+        (self.mean.len(), self.deviation.len(), self.weights.len()) == (features, features, terms)
+            && self.mean.iter().chain(&self.weights).all(|x| x.is_finite())
+            && self.deviation.iter().all(|d| d.is_finite() && *d > 0.0)
+    }
+
     /// The log-odds that the described pose is right.
     #[must_use]
     pub fn logit(&self, features: &[f64]) -> f64 {
@@ -101,7 +111,7 @@ impl Logistic {
     }
 }
 
-/// The shipped regressions.
+/// The two regressions that judge poses. The engine takes one as an argument; by default the shipped one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Verifier {
     /// What the weights were fitted on.
@@ -112,15 +122,48 @@ pub struct Verifier {
     pub triplet: Logistic,
 }
 
+/// Why a text is no verifier.
+#[derive(Debug, thiserror::Error)]
+pub enum VerifierError {
+    /// It is no JSON of the right form.
+    #[error("no verifier: {0}")]
+    Form(#[from] serde_json::Error),
+    /// It was fitted on other features than this engine measures.
+    #[error("the {regression} regression does not take {features} features with a weight for each term")]
+    Features {
+        /// `pair` or `triplet`.
+        regression: &'static str,
+        /// What this engine measures.
+        features: usize,
+    },
+}
+
+impl Verifier {
+    /// Reads a verifier from JSON, the form in which it is serialised.
+    pub fn parse(json: &str) -> Result<Self, VerifierError> {
+        let verifier: Self = serde_json::from_str(json)?;
+        let regressions =
+            [("pair", &verifier.pair, FEATURES), ("triplet", &verifier.triplet, TRIPLET_FEATURES)];
+        for (regression, logistic, features) in regressions {
+            if !logistic.fits(features) {
+                return Err(VerifierError::Features { regression, features });
+            }
+        }
+        Ok(verifier)
+    }
+}
+
 /// The verifier that ships with the product.
 #[must_use]
 #[expect(clippy::expect_used, reason = "the weights are part of the binary, and a test reads them")]
-pub fn shipped_verifier() -> &'static Verifier {
-    static SHIPPED: LazyLock<Verifier> = LazyLock::new(|| {
-        serde_json::from_str(include_str!("verifier.json"))
-            .expect("the shipped weights are checked by a test")
+pub fn shipped_verifier() -> Arc<Verifier> {
+    static SHIPPED: LazyLock<Arc<Verifier>> = LazyLock::new(|| {
+        Arc::new(
+            Verifier::parse(include_str!("verifier.json"))
+                .expect("the shipped weights are checked by a test"),
+        )
     });
-    &SHIPPED
+    Arc::clone(&SHIPPED)
 }
 
 #[cfg(test)]
@@ -130,12 +173,21 @@ mod tests {
     #[test]
     fn the_shipped_weights_fit_the_features() {
         let verifier = shipped_verifier();
-        let terms = |n: usize| 1 + n + n * (n + 1) / 2;
-        assert_eq!(verifier.pair.mean.len(), FEATURES);
-        assert_eq!(verifier.pair.weights.len(), terms(FEATURES));
-        let n = verifier.triplet.mean.len();
-        assert_eq!(verifier.triplet.weights.len(), terms(n));
-        assert!(verifier.pair.deviation.iter().chain(&verifier.triplet.deviation).all(|d| *d > 0.0));
+        assert!(verifier.pair.fits(FEATURES) && verifier.triplet.fits(TRIPLET_FEATURES));
+    }
+
+    #[test]
+    fn weights_for_other_features_are_refused() {
+        let mut other = Verifier::clone(&shipped_verifier());
+        let written = serde_json::to_string(&other).unwrap();
+        assert_eq!(Verifier::parse(&written).unwrap(), other);
+        other.triplet.weights.pop();
+        let error = Verifier::parse(&serde_json::to_string(&other).unwrap()).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "the triplet regression does not take 5 features with a weight for each term"
+        );
+        assert!(matches!(Verifier::parse("{}"), Err(VerifierError::Form(_))));
     }
 
     #[test]
