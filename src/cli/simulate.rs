@@ -8,27 +8,26 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail, ensure};
 use serde::Serialize;
 
-use crate::cloud::PlyWriter;
+use crate::cloud::{PlyWriter, PointCloud};
 use crate::control::Seed;
-use crate::geometry::Point;
-use crate::simulate::{BuildingOptions, Layout, Noise, Sensor, Survey, SurveyOptions, simulate};
+use crate::simulate::{BuildingOptions, Hazards, Layout, Noise, Sensor, Survey, SurveyOptions, simulate};
 
 /// Simulate scans of a furnished building, with the true poses beside
 #[derive(Debug, Clone, clap::Args)]
 pub struct SimulateArgs {
-    /// Folder to write: scans/*.ply, and poses.json with the truth
+    /// Folder to write: scans/*.ply, and the truth in poses.json, overlaps.json and groups.json
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// What kind of building
-    #[arg(long, value_enum, default_value_t = Kind::Office)]
-    pub kind: Kind,
+    /// What kind of building. Several, with commas: unrelated buildings that share the scans, 10 km from each other in poses.json
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "office")]
+    pub kind: Vec<Kind>,
     /// What scans it
     #[arg(long, value_enum, default_value_t = SensorKind::Panoramic)]
     pub sensor: SensorKind,
-    /// Number of scans
+    /// Number of scans, of all buildings together
     #[arg(long, default_value_t = 24)]
     pub stations: usize,
-    /// Number of rooms, a corridor not counted
+    /// Number of rooms of a building, a corridor not counted
     #[arg(long, default_value_t = 6)]
     pub rooms: usize,
     /// Another seed, another building
@@ -40,6 +39,24 @@ pub struct SimulateArgs {
     /// People who stand around the sensor, elsewhere in every scan
     #[arg(long, default_value_t = 0)]
     pub people: usize,
+    /// Share of the inner walls and doors that are of glass, 0 to 1; with any there is something to see outside, and panes make ghosts
+    #[arg(long, default_value_t = 0.0)]
+    pub glass: f32,
+    /// Share of the rooms with a mirror, 0 to 1
+    #[arg(long, default_value_t = 0.0)]
+    pub mirrors: f32,
+    /// Share of the windows with blinds and of the rooms with cables, poles and railings, 0 to 1
+    #[arg(long, default_value_t = 0.0)]
+    pub thin: f32,
+    /// Share of the furniture that swallows rays, 0 to 1
+    #[arg(long, default_value_t = 0.0)]
+    pub dark: f32,
+    /// How badly a tripod is levelled: standard deviation of each tilt, degrees
+    #[arg(long, default_value_t = 0.7, value_name = "DEGREES")]
+    pub tilt: f32,
+    /// Give every surface a colour, and every point that of its surface
+    #[arg(long)]
+    pub color: bool,
     /// Factor on the sensor's noise, dropouts and flying pixels
     #[arg(long, default_value_t = 1.0)]
     pub noise: f32,
@@ -78,6 +95,10 @@ pub enum SensorKind {
     Panoramic,
     /// 64 rings of 1,024 rays, 0.5 to 100 m
     SpinningLidar,
+    /// Twelve frames of a depth camera that moves by 0.4 m, fused in the frame of the first
+    Fragment,
+    /// A spinning lidar that moves by 0.3 m during its revolution
+    MovingLidar,
 }
 
 /// What was written.
@@ -89,48 +110,71 @@ struct Report {
 }
 
 impl SimulateArgs {
-    fn options(&self) -> SurveyOptions {
-        let layout = match self.kind {
-            Kind::Office => Layout::Office,
-            Kind::House => Layout::House,
-            Kind::Corridor => Layout::Corridor,
-            Kind::TwinRooms => Layout::TwinRooms,
-            Kind::Hall => Layout::Hall,
-        };
+    /// What to simulate, one entry a building.
+    fn options(&self) -> Vec<SurveyOptions> {
         let sensor = match self.sensor {
             SensorKind::DepthCamera => Sensor::depth_camera(320, 240),
             SensorKind::Panoramic => Sensor::panoramic(36_000),
             SensorKind::SpinningLidar => Sensor::spinning_lidar(64),
+            SensorKind::Fragment => Sensor::fragment(12),
+            SensorKind::MovingLidar => Sensor::moving_lidar(64),
         };
         let noise: Noise = sensor.noise.scaled(self.noise);
-        SurveyOptions {
+        let count = self.kind.len();
+        let building = |(number, kind): (usize, &Kind)| SurveyOptions {
             building: BuildingOptions {
-                layout,
+                layout: match kind {
+                    Kind::Office => Layout::Office,
+                    Kind::House => Layout::House,
+                    Kind::Corridor => Layout::Corridor,
+                    Kind::TwinRooms => Layout::TwinRooms,
+                    Kind::Hall => Layout::Hall,
+                },
                 rooms: self.rooms,
                 density: self.density,
+                hazards: Hazards {
+                    glass: self.glass,
+                    mirrors: self.mirrors,
+                    thin: self.thin,
+                    dark: self.dark,
+                },
                 ..BuildingOptions::default()
             },
-            sensor: Sensor { noise, ..sensor },
-            stations: self.stations,
+            sensor: Sensor { noise, tilt_deg: self.tilt, ..sensor },
+            stations: self.stations / count + usize::from(number < self.stations % count),
             least_overlap: self.least_overlap,
             people: self.people,
-            seed: Seed(self.seed),
+            colored: self.color,
+            seed: building_seed(self.seed, number),
             ..SurveyOptions::default()
-        }
+        };
+        self.kind.iter().enumerate().map(building).collect()
     }
+}
+
+/// The first building has the seed that was given, so that it is the same with and without others.
+fn building_seed(seed: u64, number: usize) -> Seed {
+    Seed(seed.wrapping_add((number as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)))
 }
 
 /// Simulates and writes.
 pub fn run(args: &SimulateArgs) -> anyhow::Result<()> {
     let options = args.options();
-    options.validate()?;
+    for building in &options {
+        building.validate()?;
+    }
     prepare_folder(&args.out, args.force)?;
-    let survey = simulate(&options)?;
+    let mut surveys = Vec::with_capacity(options.len());
+    for building in &options {
+        surveys.push(simulate(building)?);
+    }
+    let survey = surveys.into_iter().reduce(Survey::beside).context("there is no building to simulate")?;
     write_survey(&survey, &args.out)?;
+    write_facts(&survey, &args.out)?;
     let report = Report {
         scans: survey.scans.len(),
         points: survey.scans.iter().map(|scan| scan.cloud.len()).sum(),
-        rooms: survey.building.rooms.len(),
+        rooms: survey.buildings.iter().map(|building| building.rooms.len()).sum(),
     };
     if args.json {
         println!("{}", serde_json::to_string(&report)?);
@@ -171,18 +215,82 @@ pub fn write_survey(survey: &Survey, out: &Path) -> anyhow::Result<()> {
     for scan in &survey.scans {
         let file = format!("{}.ply", scan.name);
         let path = scans.join(&file);
-        write_ply(&scan.cloud.points, &path).with_context(|| format!("cannot write {}", path.display()))?;
+        write_ply(&scan.cloud, &path).with_context(|| format!("cannot write {}", path.display()))?;
         poses.insert(file, scan.model_from_scan.to_rows());
     }
-    let path = out.join("poses.json");
-    let text = serde_json::to_string_pretty(&poses)?;
-    fs::write(&path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
+    write_json(&out.join("poses.json"), &poses)
 }
 
-/// Writes bare points as a binary PLY file.
-fn write_ply(points: &[Point], path: &Path) -> io::Result<()> {
-    let mut writer = PlyWriter::new(BufWriter::new(File::create(path)?), false, &[])?;
-    points.iter().try_for_each(|point| writer.point(*point))?;
+/// Neighbours within this distance make a point one that two scans have in common, metres.
+const IN_COMMON: f32 = 0.15;
+
+/// What two scans have in common under the truth.
+#[derive(Debug, Serialize)]
+struct PairFacts<'a> {
+    a: &'a str,
+    b: &'a str,
+    /// Share of the points of `a` that the sensor of `b` saw, too.
+    a_seen_by_b: f64,
+    b_seen_by_a: f64,
+}
+
+/// Where a scan was taken.
+#[derive(Debug, Serialize)]
+struct ScanFacts {
+    building: usize,
+    /// `None` in a doorway.
+    room: Option<usize>,
+    /// Rooms of a building with the same number are furnished alike.
+    furnished_like: Option<u64>,
+    points: usize,
+}
+
+/// Writes what a judge needs to know whether the data decide: `overlaps.json`, the pairs of scans with anything in common, and
+/// `groups.json`, the building and room of every scan.
+fn write_facts(survey: &Survey, out: &Path) -> anyhow::Result<()> {
+    let files: Vec<String> = survey.scans.iter().map(|scan| format!("{}.ply", scan.name)).collect();
+    let shared = survey.shared_views(IN_COMMON);
+    let pairs: Vec<PairFacts<'_>> = (0..files.len())
+        .flat_map(|i| (i + 1..files.len()).map(move |j| (i, j)))
+        .map(|(i, j)| PairFacts {
+            a: &files[i],
+            b: &files[j],
+            a_seen_by_b: rounded(shared[i][j]),
+            b_seen_by_a: rounded(shared[j][i]),
+        })
+        .filter(|pair| pair.a_seen_by_b.max(pair.b_seen_by_a) > 0.0)
+        .collect();
+    let groups: BTreeMap<&str, ScanFacts> = survey
+        .scans
+        .iter()
+        .zip(&files)
+        .map(|(scan, file)| {
+            let room = survey.room_of(scan);
+            let rooms = survey.buildings.get(scan.building).map(|building| &building.rooms);
+            let furnished_like = room.and_then(|room| rooms?.get(room)).map(|room| room.identity);
+            let facts = ScanFacts { building: scan.building, room, furnished_like, points: scan.cloud.len() };
+            (file.as_str(), facts)
+        })
+        .collect();
+    write_json(&out.join("overlaps.json"), &pairs)?;
+    write_json(&out.join("groups.json"), &groups)
+}
+
+fn rounded(share: f64) -> f64 {
+    (share * 1e4).round() * 1e-4
+}
+
+fn write_json(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
+    let text = serde_json::to_string_pretty(value)?;
+    fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Writes points, and their colours if they have any, as a binary PLY file.
+fn write_ply(cloud: &PointCloud, path: &Path) -> io::Result<()> {
+    let mut writer = PlyWriter::new(BufWriter::new(File::create(path)?), !cloud.colors.is_empty(), &[])?;
+    for (i, point) in cloud.points.iter().enumerate() {
+        writer.colored_point(*point, cloud.colors.get(i).copied().unwrap_or_default())?;
+    }
     writer.finish()?;
     Ok(())
 }
@@ -232,5 +340,28 @@ mod tests {
         fs::write(folder.path().join("scans/notes.txt"), "mine").unwrap();
         assert!(run(&parse(folder.path(), &format!("{options} --force"))).is_err());
         assert!(folder.path().join("scans/notes.txt").exists());
+    }
+
+    #[test]
+    fn two_buildings_in_one_folder_are_told_apart_only_by_the_truth() {
+        let folder = tempfile::tempdir().unwrap();
+        run(&parse(folder.path(), "--kind hall,house --rooms 2 --stations 5 --glass 0.5 --people 1 --color"))
+            .unwrap();
+        let read = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap();
+        let poses: BTreeMap<String, [[f64; 4]; 4]> = serde_json::from_str(&read("poses.json")).unwrap();
+        let groups: serde_json::Value = serde_json::from_str(&read("groups.json")).unwrap();
+        let overlaps: Vec<serde_json::Value> = serde_json::from_str(&read("overlaps.json")).unwrap();
+        let building = |file: &str| groups[file]["building"].as_u64().unwrap();
+        assert_eq!(poses.keys().filter(|file| building(file) == 0).count(), 3);
+        assert!(poses.iter().all(|(file, pose)| (pose[0][3] > 5000.0) == (building(file) == 1)));
+        assert!(overlaps.len() >= 3);
+        for pair in overlaps {
+            let [a, b] = ["a", "b"].map(|end| pair[end].as_str().unwrap());
+            assert_eq!(building(a), building(b));
+            let share = pair["a_seen_by_b"].as_f64().unwrap();
+            assert!((0.0..=1.0).contains(&share));
+            let header = fs::read(folder.path().join("scans").join(a)).unwrap();
+            assert!(String::from_utf8_lossy(&header[..300]).contains("uchar red"));
+        }
     }
 }

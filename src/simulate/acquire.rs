@@ -1,102 +1,156 @@
 //! One scan: the sensor's rays cast into the scene, and its errors added. Each row of rays draws its own random
 //! numbers, so the points do not depend on the number of threads. Used by the survey.
 
-use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::draw::Draw;
+use super::echo::{Echo, echo};
+use super::fuse::fuse;
+use super::motion::Way;
 use super::scene::Scene;
 use super::sensor::{Raster, Sensor};
-use super::solid::{Hit, Material, Ray};
+use super::solid::Ray;
 use crate::cloud::PointCloud;
 use crate::control::Seed;
-use crate::geometry::Pose;
+use crate::geometry::{Point, Pose};
 
-/// Cosine of incidence above which a pane mirrors much of a ray back to where it came from.
-const SQUARE_ON: f32 = 0.97;
 /// Cosine of incidence below which a surface returns too little to be measured reliably.
 const GRAZING: f32 = 0.15;
 /// Share of rays that dark surfaces swallow.
 const SWALLOWED: f32 = 0.4;
 /// A jump in distance between neighbouring rays that counts as an edge: metres, and share of the distance.
 const EDGE: (f32, f32) = (0.08, 0.06);
-/// Panes that a ray may pass.
-const MOST_PANES: usize = 6;
+/// Voxels in which the frames of a moving camera are fused, metres.
+const FUSED: f32 = 0.02;
 
-/// What one ray met, before noise.
-#[derive(Debug, Clone, Copy)]
-struct Echo {
-    /// Infinite when the ray met nothing.
-    distance: f32,
-    /// Cosine of the angle between the ray and the surface's normal.
-    incidence: f32,
-    dark: bool,
+/// What rays are cast into.
+pub(super) struct Surroundings<'a> {
+    /// Scenes that share a frame.
+    pub scenes: &'a [&'a Scene],
+    /// Share of the rays at a pane that are reflected.
+    pub ghosts: f32,
+    /// Whether points have the colours of what they lie on.
+    pub colored: bool,
 }
 
-const NOTHING: Echo = Echo { distance: f32::INFINITY, incidence: 1.0, dark: false };
-
-/// Casts all rays of a sensor into scenes that share a frame.
+/// Casts all rays of a sensor, and of all its frames if it moves.
 ///
-/// `subject` tells this scan from the others of the same seed. Points are in the sensor's frame.
+/// `subject` tells this scan from the others of the same seed. Points are in the sensor's frame, at the start if it moves.
 pub(super) fn acquire(
-    scenes: &[&Scene],
+    around: &Surroundings<'_>,
     sensor: &Sensor,
     world_from_sensor: &Pose,
     seed: Seed,
     subject: u64,
 ) -> PointCloud {
     let raster = sensor.raster();
-    let draw = |purpose, row| Draw::new(seed.derive(purpose, (u128::from(subject) << 32) | row as u128));
-    let (origin, rotation) =
-        (world_from_sensor.translation.cast(), world_from_sensor.rotation.matrix().cast::<f32>());
-    let echoes: Vec<Vec<Echo>> = raster
-        .rows
-        .par_iter()
-        .enumerate()
-        .map(|(row, directions)| {
-            let mut draw = draw("simulate.cast", row);
-            let cast =
-                |direction| echo(scenes, sensor, Ray { origin, direction: rotation * direction }, &mut draw);
-            directions.iter().map(cast).collect()
+    let way = sensor.motion.map(|motion| {
+        let mut draw = Draw::new(seed.derive("simulate.way", u128::from(subject)));
+        Way::draw(&motion, &mut draw, |direction| {
+            let direction = (world_from_sensor.rotation * direction).cast();
+            let ray = Ray { origin: world_from_sensor.translation.cast(), direction };
+            let hits = around.scenes.iter().filter_map(|scene| scene.cast(&ray, 0.0, motion.way * 2.0));
+            hits.map(|hit| hit.distance).fold(motion.way * 2.0, f32::min)
         })
-        .collect();
-    let points = (0..raster.rows.len())
-        .into_par_iter()
-        .map(|row| measure(sensor, &raster, &echoes, row, &mut draw("simulate.noise", row)))
-        .collect::<Vec<_>>()
-        .concat();
-    PointCloud::from_points(points)
-}
-
-fn first_hit(scenes: &[&Scene], ray: &Ray, near: f32, far: f32) -> Option<Hit> {
-    scenes.iter().fold(None, |best: Option<Hit>, scene| {
-        scene.cast(ray, near, best.map_or(far, |hit| hit.distance)).or(best)
-    })
-}
-
-/// The first surface that returns the ray; panes let most rays pass.
-fn echo(scenes: &[&Scene], sensor: &Sensor, ray: Ray, draw: &mut Draw) -> Echo {
-    let mut near = 0.0;
-    for _ in 0..MOST_PANES {
-        let Some(hit) = first_hit(scenes, &ray, near, sensor.range[1]) else { return NOTHING };
-        let incidence = -hit.normal.dot(&ray.direction);
-        if hit.material != Material::Glass || draw.chance(if incidence > SQUARE_ON { 0.5 } else { 0.03 }) {
-            return Echo { distance: hit.distance, incidence, dark: hit.material == Material::Dark };
+    });
+    let frames = sensor.motion.map_or(1, |motion| if sensor.looks_ahead() { motion.frames } else { 1 });
+    let (mut points, mut colors) = (Vec::new(), Vec::new());
+    for frame in 0..frames {
+        // A camera takes a frame at one moment, a spinning sensor each column at another.
+        let moment = |column: usize, columns: usize| {
+            if frames > 1 { frame as f64 / (frames - 1) as f64 } else { column as f64 / columns as f64 }
+        };
+        let cast =
+            Cast { around, sensor, raster: &raster, world_from_sensor, way: way.as_ref(), seed, subject };
+        for (row_points, row_colors) in cast.frame(frame, moment) {
+            points.extend(row_points);
+            colors.extend(row_colors);
         }
-        // Past the second face of the pane, too.
-        near = hit.distance + 0.02;
     }
-    NOTHING
+    if !around.colored {
+        colors.clear();
+    }
+    if frames > 1 {
+        fuse(&points, &colors, FUSED)
+    } else {
+        PointCloud { points, colors, ..PointCloud::default() }
+    }
 }
 
-/// The points that the sensor reports for one row.
+/// One sweep over the raster.
+struct Cast<'a> {
+    around: &'a Surroundings<'a>,
+    sensor: &'a Sensor,
+    raster: &'a Raster,
+    world_from_sensor: &'a Pose,
+    way: Option<&'a Way>,
+    seed: Seed,
+    subject: u64,
+}
+
+type Row = (Vec<Point>, Vec<[u8; 3]>);
+
+impl Cast<'_> {
+    fn draw(&self, purpose: &str, frame: usize, row: usize) -> Draw {
+        let line = (frame * self.raster.rows.len() + row) as u128;
+        Draw::new(self.seed.derive(purpose, (u128::from(self.subject) << 32) | line))
+    }
+
+    /// Points and colours of all rows; `moment` of a column of so many tells when it was measured.
+    fn frame(&self, frame: usize, moment: impl Fn(usize, usize) -> f64 + Sync) -> Vec<Row> {
+        let echoes: Vec<Vec<Echo>> = self
+            .raster
+            .rows
+            .par_iter()
+            .enumerate()
+            .map(|(row, directions)| {
+                let mut draw = self.draw("simulate.cast", frame, row);
+                let columns = directions.iter().enumerate();
+                let rays = columns.map(|(column, direction)| {
+                    let pose = match self.way {
+                        Some(way) => {
+                            *self.world_from_sensor * way.start_from_moment(moment(column, directions.len()))
+                        }
+                        None => *self.world_from_sensor,
+                    };
+                    let rotation = pose.rotation.matrix().cast::<f32>();
+                    Ray { origin: pose.translation.cast(), direction: rotation * direction }
+                });
+                rays.map(|ray| echo(self.around, self.sensor, ray, &mut draw)).collect()
+            })
+            .collect();
+        (0..self.raster.rows.len())
+            .into_par_iter()
+            .map(|row| {
+                let mut draw = self.draw("simulate.noise", frame, row);
+                let measured = measure(self.sensor, self.raster, &echoes, row, &mut draw);
+                let columns = self.raster.rows[row].len();
+                measured
+                    .into_iter()
+                    .map(|(column, point)| {
+                        let color = echoes[row][column].color;
+                        match self.way {
+                            Some(way) => {
+                                let pose = way.assumed_start_from_moment(moment(column, columns));
+                                (pose.transform_point(point), color)
+                            }
+                            None => (point, color),
+                        }
+                    })
+                    .unzip()
+            })
+            .collect()
+    }
+}
+
+/// The columns of one row that report a point, with the point in the frame of the sensor at that moment.
 fn measure(
     sensor: &Sensor,
     raster: &Raster,
     echoes: &[Vec<Echo>],
     row: usize,
     draw: &mut Draw,
-) -> Vec<[f32; 3]> {
+) -> Vec<(usize, Point)> {
     let noise = &sensor.noise;
     let mut points = Vec::with_capacity(echoes[row].len());
     for (column, (direction, echo)) in raster.rows[row].iter().zip(&echoes[row]).enumerate() {
@@ -122,8 +176,7 @@ fn measure(
         let depth = if sensor.looks_ahead() { distance * direction.z } else { distance };
         let measured = distance + noise.sigma(depth) * draw.normal();
         if sensor.range[0] <= measured && measured <= sensor.range[1] {
-            let p: Vector3<f32> = direction * measured;
-            points.push([p.x, p.y, p.z]);
+            points.push((column, (direction * measured).into()));
         }
     }
     points
@@ -143,7 +196,8 @@ fn neighbours(raster: &Raster, echoes: &[Vec<Echo>], row: usize, column: usize) 
 mod tests {
     use super::*;
     use crate::simulate::sensor::Noise;
-    use crate::simulate::solid::Solid;
+    use crate::simulate::solid::{Material, Solid};
+    use nalgebra::Vector3;
 
     /// A wall 2.5 m to 3 m in front of a camera that stands at the origin and looks along z.
     fn wall() -> Scene {
@@ -151,7 +205,12 @@ mod tests {
     }
 
     fn scan(scene: &Scene, sensor: &Sensor) -> PointCloud {
-        acquire(&[scene], sensor, &Pose::identity(), Seed(4), 0)
+        seen(scene, sensor, 0.0)
+    }
+
+    fn seen(scene: &Scene, sensor: &Sensor, ghosts: f32) -> PointCloud {
+        let around = Surroundings { scenes: &[scene], ghosts, colored: true };
+        acquire(&around, sensor, &Pose::identity(), Seed(4), 0)
     }
 
     #[test]
@@ -206,5 +265,70 @@ mod tests {
         let cloud = scan(&Scene::new(&solids), &Sensor::depth_camera(160, 120));
         let behind = cloud.points.iter().filter(|[_, _, z]| *z > 2.0).count() as f32 / cloud.len() as f32;
         assert!((0.7..0.97).contains(&behind), "{behind}");
+    }
+
+    /// A plate of a material at 1 m in front of the wall, tilted by 45 degrees, so that it reflects what is far to the right (+x).
+    fn behind_a_plate(material: Material) -> Scene {
+        let mut solids = wall().solids().to_vec();
+        let tilt =
+            *nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), -std::f32::consts::FRAC_PI_4).matrix();
+        let plate =
+            Solid::between(Vector3::new(-0.5, -0.5, -0.005), Vector3::new(0.5, 0.5, 0.005)).of(material);
+        solids.push(plate.moved(&tilt, &Vector3::new(0.0, 0.0, 1.0)));
+        for side in [-1.0f32, 1.0] {
+            let (near, far) = (side * 3.0, side * 3.2);
+            let (low, high) = (near.min(far), near.max(far));
+            solids.push(
+                Solid::between(Vector3::new(low, -9.0, -9.0), Vector3::new(high, 9.0, 9.0))
+                    .painted([9, 8, 7]),
+            );
+        }
+        Scene::new(&solids)
+    }
+
+    #[test]
+    fn mirrors_show_ghosts_behind_them_and_panes_show_few() {
+        let mut camera = Sensor::depth_camera(80, 60);
+        camera.noise = Noise { base: 0.0, growth: 0.0, dropout: 0.0, mixed: 0.0 };
+        // Through the plate's middle a ray goes 1 m ahead, then 3 m aside: a ghost 4 m away, painted like the side wall.
+        let ghosts = |material, share| {
+            let cloud = seen(&behind_a_plate(material), &camera, share);
+            let middle =
+                cloud.points.iter().zip(&cloud.colors).filter(|([x, y, z], _)| (x / z).hypot(y / z) < 0.1);
+            let all = middle.clone().count() as f32;
+            middle.filter(|([.., z], color)| (3.4..4.8).contains(z) && **color == [9, 8, 7]).count() as f32
+                / all
+        };
+        assert!(ghosts(Material::Mirror, 0.0) > 0.95);
+        assert!(ghosts(Material::Matte, 0.5) < 0.01);
+        assert!((0.2..0.4).contains(&ghosts(Material::Glass, 0.3)));
+        assert!(ghosts(Material::Glass, 0.0) < 0.01);
+    }
+
+    #[test]
+    fn a_moving_camera_sees_more_than_its_first_frame_and_errs_by_its_drift() {
+        let sensor = Sensor::fragment(8);
+        let (fused, first) = (scan(&wall(), &sensor), scan(&wall(), &Sensor { motion: None, ..sensor }));
+        let wide = |cloud: &PointCloud| {
+            cloud.points.iter().map(|[x, y, z]| (x / z).abs().max((y / z).abs())).fold(0.0, f32::max)
+        };
+        assert!(wide(&fused) > wide(&first) + 0.03, "{} and {}", wide(&fused), wide(&first));
+        let mut errors: Vec<f32> = fused.points.iter().map(|p| (p[2] - 2.5).abs()).collect();
+        errors.sort_by(f32::total_cmp);
+        assert!(errors[errors.len() / 2] < 0.02, "median error {} m", errors[errors.len() / 2]);
+    }
+
+    #[test]
+    fn a_moving_lidar_maps_its_columns_back_to_its_start() {
+        let room =
+            |side: f32| Solid::between(Vector3::new(-side, -side, -2.0), Vector3::new(side, side, 2.0));
+        let scene = Scene::new(&[room(4.0)]);
+        let cloud = scan(&scene, &Sensor::moving_lidar(16));
+        let off = cloud
+            .points
+            .iter()
+            .filter(|p| p[0].abs().max(p[1].abs()) - 4.0 > 0.15 || p[2].abs() > 2.15)
+            .count();
+        assert!(cloud.len() > 10_000 && off * 100 < cloud.len(), "{off} of {}", cloud.len());
     }
 }

@@ -4,10 +4,12 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
+use super::draw::Draw;
 use super::furnish::{Footprint, furnish};
+use super::hazards::{Hazards, darken, glaze, hazardous};
 use super::plan::{Doorway, Layout, Room, draw_plan};
 use super::scene::Scene;
-use super::solid::Ray;
+use super::solid::{Ray, Solid};
 use super::walls::shell;
 use crate::control::Seed;
 
@@ -22,11 +24,19 @@ pub struct BuildingOptions {
     pub room_size: [f32; 2],
     /// How much stands in the rooms: 0 is empty, 1 is usual, 2 is packed.
     pub density: f32,
+    /// What makes scans disagree about free space.
+    pub hazards: Hazards,
 }
 
 impl Default for BuildingOptions {
     fn default() -> Self {
-        Self { layout: Layout::Office, rooms: 6, room_size: [4.0, 7.0], density: 1.0 }
+        Self {
+            layout: Layout::Office,
+            rooms: 6,
+            room_size: [4.0, 7.0],
+            density: 1.0,
+            hazards: Hazards::default(),
+        }
     }
 }
 
@@ -42,6 +52,9 @@ pub enum BuildingError {
     /// Negative, not a number, or more than fits.
     #[error("the density of furniture must lie between 0 and 3, not {0}")]
     Density(f32),
+    /// Negative, not a number, or more than all.
+    #[error("the share of {0} must lie between 0 and 1, not {1}")]
+    Hazard(&'static str, f32),
 }
 
 impl BuildingOptions {
@@ -56,6 +69,9 @@ impl BuildingOptions {
         }
         if !(0.0..=3.0).contains(&self.density) {
             return Err(BuildingError::Density(self.density));
+        }
+        if let Some((hazard, share)) = self.hazards.first_wrong() {
+            return Err(BuildingError::Hazard(hazard, share));
         }
         Ok(())
     }
@@ -77,10 +93,22 @@ impl Building {
     /// Draws a building: the same for the same options and seed.
     pub fn new(options: &BuildingOptions, seed: Seed) -> Result<Self, BuildingError> {
         options.validate()?;
-        let plan = draw_plan(options.layout, options.rooms, options.room_size, seed);
-        let furnished: Vec<_> =
-            plan.rooms.par_iter().map(|room| furnish(room, &plan, options.density, seed)).collect();
+        let mut plan = draw_plan(options.layout, options.rooms, options.room_size, seed);
+        glaze(&mut plan, &options.hazards, seed);
+        let furnished: Vec<_> = plan
+            .rooms
+            .par_iter()
+            .map(|room| {
+                let (mut solids, footprints) = furnish(room, &plan, options.density, seed);
+                let draw = |purpose| Draw::new(seed.derive(purpose, u128::from(room.identity)));
+                darken(&mut solids, options.hazards.dark, &mut draw("simulate.dark"));
+                paint(&mut solids, [40, 230], &mut draw("simulate.paint"));
+                (solids, footprints)
+            })
+            .collect();
         let mut solids = shell(&plan);
+        solids.extend(hazardous(&plan, &options.hazards, seed));
+        paint(&mut solids, [170, 240], &mut Draw::new(seed.derive("simulate.paint", u128::MAX)));
         let mut footprints = Vec::new();
         for (room_solids, room_footprints) in furnished {
             solids.extend(room_solids);
@@ -112,6 +140,13 @@ impl Building {
             offset[doorway.axis].abs() < doorway.width * 0.5 && offset[1 - doorway.axis].abs() < 0.3
         });
         (in_room || in_doorway) && self.footprints.iter().all(|footprint| !footprint.reaches([x, y], radius))
+    }
+}
+
+/// Gives every solid a colour of its own, each channel in an interval.
+fn paint(solids: &mut [Solid], [low, high]: [usize; 2], draw: &mut Draw) {
+    for solid in solids {
+        solid.color = [(); 3].map(|()| draw.count(low, high) as u8);
     }
 }
 

@@ -205,7 +205,10 @@ impl Furnisher<'_> {
                 if (0..2).any(|k| own[k].abs() > self.half[k] + wall.thickness) {
                     continue;
                 }
-                let walked = matches!(opening.kind, OpeningKind::Passage | OpeningKind::Door(_));
+                let walked = matches!(
+                    opening.kind,
+                    OpeningKind::Passage | OpeningKind::Door(_) | OpeningKind::GlassDoor(_)
+                );
                 let (along, across) = ((opening.to - opening.from) * 0.5, if walked { 1.25 } else { 0.5 });
                 let half = if wall.axis == 0 { [along, across] } else { [across, along] };
                 let zone = Footprint { centre: own, half, angle: 0.0, top: opening.sill };

@@ -1,8 +1,8 @@
 //! A ray-casting scan simulator with known truth, for tests, calibration and the demo.
 //!
 //! [`simulate`] draws a furnished [`Building`] from a seed, finds stations in it whose views overlap, and scans it
-//! with a depth camera, a panoramic laser scanner or a spinning `LiDAR`: noise, dropouts, flying pixels, glass,
-//! occlusion, and people who move. Uses [`crate::geometry`], [`crate::cloud`] and [`crate::control`] only; the same
+//! with a depth camera, a panoramic laser scanner or a spinning `LiDAR`, standing or moving: noise, dropouts, flying pixels,
+//! occlusion, people who move, and the [`Hazards`] of glass, mirrors, thin structure and dark surfaces. Uses [`crate::geometry`], [`crate::cloud`] and [`crate::control`] only; the same
 //! options give the same points at any number of threads.
 //!
 //! ```
@@ -21,8 +21,13 @@
 mod acquire;
 mod building;
 mod draw;
+mod echo;
+mod facts;
 mod furnish;
 mod furniture;
+mod fuse;
+mod hazards;
+mod motion;
 mod overlap;
 mod people;
 mod plan;
@@ -34,9 +39,11 @@ mod survey;
 mod walls;
 
 pub use building::{Building, BuildingError, BuildingOptions};
+pub use hazards::Hazards;
+pub use motion::Motion;
 pub use plan::{Doorway, Layout, Room, RoomKind};
 pub use scene::Scene;
 pub use sensor::{Noise, Pattern, Sensor, SensorError};
 pub use solid::{Hit, Material, Ray, Shape, Solid};
 pub use stations::StationError;
-pub use survey::{SimulatedScan, Survey, SurveyError, SurveyOptions, simulate};
+pub use survey::{APART, SimulatedScan, Survey, SurveyError, SurveyOptions, simulate};

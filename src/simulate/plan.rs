@@ -87,6 +87,8 @@ pub(super) enum OpeningKind {
     Passage,
     /// A door that stands open by an angle (rad), hinged at `from`.
     Door(f32),
+    /// The same, of glass in a frame.
+    GlassDoor(f32),
     /// A window without a pane.
     Hole,
     /// A window with a pane.
@@ -102,6 +104,8 @@ pub(super) struct Wall {
     pub to: f32,
     pub thickness: f32,
     pub openings: Vec<Opening>,
+    /// Of glass between posts instead of stone.
+    pub glazed: bool,
 }
 
 /// Where one walks from one room into another.
@@ -237,12 +241,13 @@ fn raise(layout: Layout, rows: &[Row], draw: &mut Draw) -> Plan {
         to,
         thickness,
         openings: Vec::new(),
+        glazed: false,
     }));
     plan
 }
 
 fn upright(at: f32, y: f32, depth: f32, thickness: f32) -> Wall {
-    Wall { axis: 1, at, from: y, to: y + depth, thickness, openings: Vec::new() }
+    Wall { axis: 1, at, from: y, to: y + depth, thickness, openings: Vec::new(), glazed: false }
 }
 
 fn room_kind(layout: Layout, passage: bool, index: usize) -> RoomKind {

@@ -11,6 +11,8 @@ pub enum Material {
     Dark,
     /// Lets most rays pass, and returns the rest when hit squarely.
     Glass,
+    /// Sends every ray on as light is reflected: what it meets then seems to lie behind the surface.
+    Mirror,
 }
 
 /// A shape in its own frame, with its centre (a triangle: its reference point) at the origin. Metres.
@@ -52,7 +54,12 @@ pub struct Hit {
     pub normal: Vector3<f32>,
     /// Of the surface.
     pub material: Material,
+    /// Red, green, blue of the surface.
+    pub color: [u8; 3],
 }
+
+/// The colour of what nobody painted.
+const UNPAINTED: [u8; 3] = [190, 186, 180];
 
 /// A shape placed in the world: `x_world = rotation x_solid + centre`.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,13 +72,15 @@ pub struct Solid {
     pub centre: Vector3<f32>,
     /// Of its surface.
     pub material: Material,
+    /// Red, green, blue of its surface.
+    pub color: [u8; 3],
 }
 
 impl Solid {
     /// A matte shape with the world's axes.
     #[must_use]
     pub fn new(shape: Shape, centre: Vector3<f32>) -> Self {
-        Self { shape, rotation: Matrix3::identity(), centre, material: Material::Matte }
+        Self { shape, rotation: Matrix3::identity(), centre, material: Material::Matte, color: UNPAINTED }
     }
 
     /// A cuboid along the world's axes, between two opposite corners.
@@ -94,6 +103,12 @@ impl Solid {
     #[must_use]
     pub fn of(self, material: Material) -> Self {
         Self { material, ..self }
+    }
+
+    /// The same shape in another colour.
+    #[must_use]
+    pub fn painted(self, color: [u8; 3]) -> Self {
+        Self { color, ..self }
     }
 
     /// Turned about the world's origin, then moved.
@@ -140,7 +155,7 @@ impl Solid {
         }?;
         let normal = self.rotation * normal;
         let normal = if normal.dot(&ray.direction) > 0.0 { -normal } else { normal };
-        Some(Hit { distance, normal, material: self.material })
+        Some(Hit { distance, normal, material: self.material, color: self.color })
     }
 }
 

@@ -136,8 +136,8 @@ fn eye_height(draw: &mut Draw) -> f32 {
     draw.between(1.15, 1.75)
 }
 
-/// A sensor at a place, turned any way about the vertical: a camera held by hand, a scanner levelled within a degree or
-/// two.
+/// A sensor at a place, turned any way about the vertical: a camera held by hand, a scanner levelled more or
+/// less.
 fn mounted(sensor: &Sensor, place: Vector3<f32>, draw: &mut Draw) -> Pose {
     let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), f64::from(draw.angle()));
     let rotation = if sensor.looks_ahead() {
@@ -150,7 +150,8 @@ fn mounted(sensor: &Sensor, place: Vector3<f32>, draw: &mut Draw) -> Pose {
             * Rotation3::from_matrix_unchecked(ahead)
             * Rotation3::from_axis_angle(&Vector3::z_axis(), roll)
     } else {
-        let tilt = Vector3::new(draw.normal(), draw.normal(), 0.0).map(|t| f64::from(t.to_radians() * 0.7));
+        let tilt = Vector3::new(draw.normal(), draw.normal(), 0.0)
+            .map(|t| f64::from(t.to_radians() * sensor.tilt_deg));
         heading * Rotation3::new(tilt)
     };
     Pose::new(rotation, place.cast())

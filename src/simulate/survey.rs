@@ -6,10 +6,9 @@ use std::collections::BTreeSet;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::acquire::acquire;
+use super::acquire::{Surroundings, acquire};
 use super::building::{Building, BuildingError, BuildingOptions};
 use super::draw::Draw;
-use super::overlap::Neighbourhood;
 use super::people::people_around;
 use super::scene::Scene;
 use super::sensor::{Sensor, SensorError};
@@ -31,6 +30,8 @@ pub struct SurveyOptions {
     pub least_overlap: f32,
     /// People around the sensor, elsewhere in every scan.
     pub people: usize,
+    /// Whether points have the colours of what they lie on.
+    pub colored: bool,
     /// Rigs that share the work; each scans its own part of the building.
     pub rigs: usize,
     /// Everything random follows from it.
@@ -45,6 +46,7 @@ impl Default for SurveyOptions {
             stations: 24,
             least_overlap: 0.3,
             people: 0,
+            colored: false,
             rigs: 1,
             seed: Seed(0),
         }
@@ -100,16 +102,22 @@ pub struct SimulatedScan {
     pub model_from_scan: Pose,
     /// Which rig took it, from 0.
     pub rig: usize,
+    /// Which of the survey's buildings it shows.
+    pub building: usize,
 }
 
 /// A simulated survey.
 #[derive(Debug, Clone)]
 pub struct Survey {
-    /// The building that was scanned.
-    pub building: Building,
+    /// The buildings that were scanned, each in its own frame; usually one. The second one stands [`APART`] metres from the first
+    /// along x in the model frame, and so on.
+    pub buildings: Vec<Building>,
     /// The scans, sorted by their meaningless names.
     pub scans: Vec<SimulatedScan>,
 }
+
+/// Unrelated buildings are this far from each other in the model frame, metres: hundreds of times as far as any of them is wide.
+pub const APART: f64 = 10_000.0;
 
 /// Simulates a survey: the same for the same options, at any number of threads of the ambient rayon pool.
 pub fn simulate(options: &SurveyOptions) -> Result<Survey, SurveyError> {
@@ -128,13 +136,17 @@ pub fn simulate(options: &SurveyOptions) -> Result<Survey, SurveyError> {
             let mut draw = Draw::new(seed.derive("simulate.people", station as u128));
             let eye: Vector3<f32> = model_from_scan.translation.cast();
             let people: Scene = people_around(&building, &eye, options.people, &mut draw);
-            let scenes = [&building.scene, &people];
-            let cloud = acquire(&scenes, &options.sensor, &model_from_scan, seed, station as u64);
-            SimulatedScan { name, cloud, model_from_scan, rig }
+            let around = Surroundings {
+                scenes: &[&building.scene, &people],
+                ghosts: options.building.hazards.ghosts(),
+                colored: options.colored,
+            };
+            let cloud = acquire(&around, &options.sensor, &model_from_scan, seed, station as u64);
+            SimulatedScan { name, cloud, model_from_scan, rig, building: 0 }
         })
         .collect();
     scans.sort_by(|a, b| a.name.cmp(&b.name));
-    Ok(Survey { building, scans })
+    Ok(Survey { buildings: vec![building], scans })
 }
 
 /// Cuts the stations into equal parts along the longer side of the building.
@@ -160,35 +172,10 @@ fn draw_names(count: usize, draw: &mut Draw) -> Vec<String> {
     names
 }
 
-impl Survey {
-    /// Share of the points of scan `of` that lie within `tolerance` metres of a point of scan `with` under the truth.
-    ///
-    /// The tolerance should exceed the spacing of the points. `None` if there is no such scan.
-    #[must_use]
-    pub fn overlap(&self, of: usize, with: usize, tolerance: f32) -> Option<f64> {
-        let (of, with) = (self.scans.get(of)?, self.scans.get(with)?);
-        let index = Neighbourhood::new(&with.cloud, &with.model_from_scan, tolerance);
-        Some(index.share_of(&of.cloud, &of.model_from_scan))
-    }
-
-    /// [`Survey::overlap`] of all pairs: row `of`, column `with`.
-    #[must_use]
-    pub fn overlaps(&self, tolerance: f32) -> Vec<Vec<f64>> {
-        let columns: Vec<Vec<f64>> = self
-            .scans
-            .par_iter()
-            .map(|with| {
-                let index = Neighbourhood::new(&with.cloud, &with.model_from_scan, tolerance);
-                self.scans.iter().map(|of| index.share_of(&of.cloud, &of.model_from_scan)).collect()
-            })
-            .collect();
-        (0..self.scans.len()).map(|of| columns.iter().map(|column| column[of]).collect()).collect()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simulate::overlap::Neighbourhood;
     use crate::simulate::plan::Layout;
 
     fn small(layout: Layout, sensor: Sensor, stations: usize) -> SurveyOptions {
@@ -293,7 +280,7 @@ mod tests {
                 ..SurveyOptions::demo(Seed(0))
             };
             let survey = simulate(&options).unwrap();
-            for room in &survey.building.rooms {
+            for room in &survey.buildings[0].rooms {
                 let inside = |scan: &SimulatedScan| {
                     (0..2).all(|k| {
                         (room.low[k]..room.high[k]).contains(&(scan.model_from_scan.translation[k] as f32))
@@ -320,10 +307,31 @@ mod tests {
         let survey = simulate(&options).unwrap();
         let of_rig = |rig| survey.scans.iter().filter(move |scan| scan.rig == rig);
         assert_eq!((of_rig(0).count(), of_rig(1).count()), (5, 4));
-        let (low, high) = survey.building.scene.bounds();
+        let (low, high) = survey.buildings[0].scene.bounds();
         let axis = usize::from(high.y - low.y > high.x - low.x);
         let end = of_rig(0).map(|scan| scan.model_from_scan.translation[axis]).fold(f64::MIN, f64::max);
         assert!(of_rig(1).all(|scan| scan.model_from_scan.translation[axis] >= end));
+    }
+
+    #[test]
+    fn buildings_beside_each_other_keep_their_scans_apart_and_mix_their_names() {
+        let options = small(Layout::Hall, Sensor::panoramic(3000), 3);
+        let one = simulate(&options).unwrap();
+        let both = one.clone().beside(one.clone());
+        assert_eq!((both.buildings.len(), both.scans.len()), (2, 6));
+        let names: BTreeSet<&String> = both.scans.iter().map(|scan| &scan.name).collect();
+        assert_eq!(names.len(), 6, "names of both are unique");
+        assert!(both.scans.is_sorted_by(|a, b| a.name < b.name));
+        let second: Vec<_> = both.scans.iter().filter(|scan| scan.building == 1).collect();
+        assert_eq!(second.len(), 3);
+        assert!(second.iter().all(|scan| scan.model_from_scan.translation.x > 0.9 * APART));
+        let third = both.clone().beside(one);
+        assert_eq!(third.scans.iter().map(|scan| scan.building).max(), Some(2));
+        for (i, row) in both.overlaps(0.15).iter().enumerate() {
+            for (j, share) in row.iter().enumerate() {
+                assert!(both.scans[i].building == both.scans[j].building || *share == 0.0);
+            }
+        }
     }
 
     #[test]

@@ -39,7 +39,7 @@ fn point(wall: &Wall, along: f32, across: f32, z: f32) -> Vector3<f32> {
 }
 
 /// A cuboid of a wall: an interval along it, half its depth, and an interval above the floor.
-fn part(wall: &Wall, (from, to): (f32, f32), half_depth: f32, (low, high): (f32, f32)) -> Solid {
+pub(super) fn part(wall: &Wall, (from, to): (f32, f32), half_depth: f32, (low, high): (f32, f32)) -> Solid {
     Solid::between(point(wall, from, -half_depth, low), point(wall, to, half_depth, high))
 }
 
@@ -51,7 +51,7 @@ fn wall_solids(wall: &Wall, height: f32) -> Vec<Solid> {
     let mut from = wall.from;
     for opening in &openings {
         let stretch = (opening.from, opening.to);
-        solids.push(part(wall, (from, opening.from), half, (0.0, height)));
+        solids.extend(stretch_of(wall, (from, opening.from), height));
         solids.push(part(wall, stretch, half, (opening.head, height)));
         if opening.sill > 0.0 {
             solids.push(part(wall, stretch, half, (0.0, opening.sill)));
@@ -59,7 +59,26 @@ fn wall_solids(wall: &Wall, height: f32) -> Vec<Solid> {
         solids.extend(frame(wall, opening));
         from = opening.to;
     }
-    solids.push(part(wall, (from, wall.to), half, (0.0, height)));
+    solids.extend(stretch_of(wall, (from, wall.to), height));
+    solids
+}
+
+/// A stretch of wall without openings: solid, or panes between posts and rails.
+fn stretch_of(wall: &Wall, (from, to): (f32, f32), height: f32) -> Vec<Solid> {
+    const RAIL: f32 = 0.06;
+    if !wall.glazed {
+        return vec![part(wall, (from, to), wall.thickness * 0.5, (0.0, height))];
+    }
+    let panes = ((to - from) / 1.3).ceil().max(1.0);
+    let mut solids = vec![
+        part(wall, (from, to), 0.03, (0.0, RAIL)),
+        part(wall, (from, to), 0.03, (height - 5.0 * RAIL, height)),
+        part(wall, (from, to), 0.005, (RAIL, height - 5.0 * RAIL)).of(Material::Glass),
+    ];
+    solids.extend((0..=panes as usize).map(|i| {
+        let at = from + (to - from) * i as f32 / panes;
+        part(wall, (at - 0.025, at + 0.025), 0.03, (0.0, height))
+    }));
     solids
 }
 
@@ -70,7 +89,7 @@ fn frame(wall: &Wall, opening: &Opening) -> Vec<Solid> {
     let bar = 0.06;
     let mut solids = Vec::new();
     match kind {
-        OpeningKind::Passage | OpeningKind::Door(_) => {
+        OpeningKind::Passage | OpeningKind::Door(_) | OpeningKind::GlassDoor(_) => {
             solids.push(part(wall, (from - bar, from + 0.02), proud, (0.0, head + bar)));
             solids.push(part(wall, (to - 0.02, to + bar), proud, (0.0, head + bar)));
             solids.push(part(wall, (from, to), proud, (head - 0.02, head + bar)));
@@ -91,7 +110,7 @@ fn frame(wall: &Wall, opening: &Opening) -> Vec<Solid> {
     }
     match kind {
         OpeningKind::Pane => solids.push(part(wall, (from, to), 0.004, (sill, head)).of(Material::Glass)),
-        OpeningKind::Door(angle) => {
+        OpeningKind::Door(angle) | OpeningKind::GlassDoor(angle) => {
             let hinge = point(wall, from + 0.02, wall.thickness * 0.5, 0.0);
             let width = to - from - 0.05;
             let leaf = Solid::between(Vector3::new(0.0, -0.02, 0.01), Vector3::new(width, 0.02, head - 0.03));
@@ -99,6 +118,8 @@ fn frame(wall: &Wall, opening: &Opening) -> Vec<Solid> {
             let handle = Solid::rod(Vector3::new(x, -0.07, z), Vector3::new(x, 0.07, z), 0.012);
             // A wall along y has its hinge axis turned by a quarter, and opens to the other side.
             let turn = if wall.axis == 0 { angle } else { std::f32::consts::FRAC_PI_2 - angle };
+            let glass = matches!(kind, OpeningKind::GlassDoor(_));
+            let leaf = if glass { leaf.of(Material::Glass) } else { leaf };
             solids.extend([leaf, handle].map(|solid| solid.moved(&yaw(turn), &hinge)));
         }
         OpeningKind::Passage | OpeningKind::Hole => {}
