@@ -61,7 +61,7 @@ impl Survey {
             return 0.0;
         };
         let by_from_of = by.model_from_scan.inverse() * of.model_from_scan;
-        let building_from_by = Pose::from_translation(-self.place_of(by.building)) * by.model_from_scan;
+        let building_from_by = Pose::from_translation(-place_of(by.building)) * by.model_from_scan;
         let rotation = building_from_by.rotation.matrix().cast::<f32>();
         let eye: Vector3<f32> = building_from_by.translation.cast();
         let seen = |point: &[f32; 3]| {
@@ -81,22 +81,17 @@ impl Survey {
     /// The room of its building in which a scan was taken; `None` in a doorway.
     #[must_use]
     pub fn room_of(&self, scan: &SimulatedScan) -> Option<usize> {
-        let at = scan.model_from_scan.translation - self.place_of(scan.building);
+        let at = scan.model_from_scan.translation - place_of(scan.building);
         let inside = |k: usize, low: f32, high: f32| (f64::from(low)..f64::from(high)).contains(&at[k]);
         let rooms = &self.buildings.get(scan.building)?.rooms;
         rooms.iter().position(|room| (0..2).all(|k| inside(k, room.low[k], room.high[k])))
-    }
-
-    /// Where the origin of a building lies in the model frame.
-    fn place_of(&self, building: usize) -> Vector3<f64> {
-        Vector3::new(APART * building as f64, 0.0, 0.0)
     }
 
     /// This survey and one of other buildings as one, with the scans of both mixed: a folder that holds what does not belong together.
     #[must_use]
     pub fn beside(mut self, other: Self) -> Self {
         let first = self.buildings.len();
-        let place = Pose::from_translation(self.place_of(first));
+        let place = Pose::from_translation(place_of(first));
         self.buildings.extend(other.buildings);
         for mut scan in other.scans {
             while self.scans.iter().any(|known| known.name == scan.name) {
@@ -111,9 +106,13 @@ impl Survey {
     }
 }
 
+/// Where the origin of a building lies in the model frame.
+fn place_of(building: usize) -> Vector3<f64> {
+    Vector3::new(APART * building as f64, 0.0, 0.0)
+}
+
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::control::Seed;
     use crate::simulate::{BuildingOptions, Layout, Sensor, SurveyOptions, simulate};
 
