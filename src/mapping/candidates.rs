@@ -2,9 +2,12 @@
 //! between them proposes one; proposals that agree form a cluster; the cluster whose edges weigh most wins, and the heaviest
 //! different cluster is its rival.
 
+use std::collections::BTreeSet;
+
 use nalgebra::Vector3;
 
 use super::component::Component;
+use super::decision::DecidedJoin;
 use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
@@ -28,6 +31,9 @@ pub struct Proposal {
     pub in_a_from_in_b: Pose,
     /// softplus(score).
     pub evidence: f64,
+    /// What the hypothesis is worth to a rival: the same, or what the pair alone says if that is more. Third scans that are themselves
+    /// misplaced can talk a score down, so a rival keeps its own word.
+    pub doubt: f64,
     /// Centroid of `in_b` in the frame of b, metres: where distances between poses are measured.
     centroid: Vector3<f64>,
 }
@@ -43,7 +49,12 @@ pub struct Candidate {
     pub rival: f64,
     /// One proposal an edge, those in the cluster.
     pub members: Vec<Proposal>,
+    /// A client decided it: nothing else is asked.
+    pub decided: bool,
 }
+
+/// Stands for the support of a join that a client decided.
+pub const DECIDED: f64 = 1e6;
 
 impl Candidate {
     /// Support with the rival's share taken off: what joins are ranked and judged by.
@@ -67,7 +78,8 @@ pub fn proposals(graph: &ScanGraph, a: &Component, b: &Component) -> Vec<Proposa
             };
             for (motion, h) in edge.motions_from(*in_b) {
                 let evidence = softplus(h.score);
-                if evidence > LEAST_EVIDENCE {
+                let doubt = softplus(h.score.max(h.hypothesis.logit));
+                if doubt > LEAST_EVIDENCE {
                     let a_from_b = *a_from_local * motion * local_from_b;
                     found.push(Proposal {
                         a_from_b,
@@ -75,6 +87,7 @@ pub fn proposals(graph: &ScanGraph, a: &Component, b: &Component) -> Vec<Proposa
                         in_b: *in_b,
                         in_a_from_in_b: motion,
                         evidence,
+                        doubt,
                         centroid,
                     });
                 }
@@ -85,7 +98,63 @@ pub fn proposals(graph: &ScanGraph, a: &Component, b: &Component) -> Vec<Proposa
     found
 }
 
-/// Clusters the proposals between two components. `voxel` in metres. `None` without proposals.
+/// Clusters the proposals between two components, the best supported first; every one differs from those before it by more than
+/// the rival distance. `voxel` in metres.
+#[must_use]
+pub fn candidates(
+    graph: &ScanGraph,
+    a: &Component,
+    b: &Component,
+    voxel: f64,
+    options: &MappingOptions,
+    most: usize,
+) -> Vec<Candidate> {
+    if let Some(join) = options.decisions.join_between(graph, a, b) {
+        return vec![decided(&join, graph, b)];
+    }
+    let mut proposals = proposals(graph, a, b);
+    if options.decisions.forbid_any() {
+        proposals.retain(|p| !options.decisions.forbids(graph, a, b, &p.a_from_b, options));
+    }
+    let reach = options.cluster_voxels * voxel;
+    let sums = |centre: usize| {
+        members(&proposals, centre, options.cluster_angle, reach)
+            .fold((0.0, 0.0), |(evidence, doubt), p| (evidence + p.evidence, doubt + p.doubt))
+    };
+    let mut clusters: Vec<(f64, f64, usize)> = centres(&proposals)
+        .into_iter()
+        .map(|centre| {
+            let (evidence, doubt) = sums(centre);
+            (evidence, doubt, centre)
+        })
+        .collect();
+    clusters.sort_by(|x, y| y.0.total_cmp(&x.0).then(y.1.total_cmp(&x.1)).then(x.2.cmp(&y.2)));
+    let differ = |x: &Proposal, y: &Proposal| {
+        let apart = options.rival_voxels * voxel;
+        !within(x, y, options.rival_angle, apart) || !within(y, x, options.rival_angle, apart)
+    };
+    let mut kept: Vec<(f64, usize)> = Vec::new();
+    for (support, _, centre) in &clusters {
+        if kept.len() < most && kept.iter().all(|(_, k)| differ(&proposals[*k], &proposals[*centre])) {
+            kept.push((*support, *centre));
+        }
+    }
+    let rival_of = |centre: usize| {
+        let others = clusters.iter().filter(|(_, _, c)| differ(&proposals[centre], &proposals[*c]));
+        others.map(|(_, doubt, _)| *doubt).fold(0.0, f64::max)
+    };
+    kept.into_iter()
+        .map(|(support, centre)| Candidate {
+            a_from_b: proposals[centre].a_from_b,
+            support,
+            rival: rival_of(centre),
+            members: members(&proposals, centre, options.cluster_angle, reach).copied().collect(),
+            decided: false,
+        })
+        .collect()
+}
+
+/// The best supported candidate. `None` without proposals.
 #[must_use]
 pub fn best_candidate(
     graph: &ScanGraph,
@@ -94,26 +163,28 @@ pub fn best_candidate(
     voxel: f64,
     options: &MappingOptions,
 ) -> Option<Candidate> {
-    let proposals = proposals(graph, a, b);
-    let reach = options.cluster_voxels * voxel;
-    let clusters: Vec<(f64, usize)> = (0..proposals.len().min(MAX_CENTRES))
-        .map(|centre| {
-            (members(&proposals, centre, options.cluster_angle, reach).map(|p| p.evidence).sum(), centre)
-        })
-        .collect();
-    let &(support, centre) = clusters.iter().max_by(|x, y| x.0.total_cmp(&y.0).then(y.1.cmp(&x.1)))?;
-    let best = &proposals[centre];
-    let differs = |p: &Proposal| {
-        !within(best, p, options.rival_angle, options.rival_voxels * voxel)
-            || !within(p, best, options.rival_angle, options.rival_voxels * voxel)
+    candidates(graph, a, b, voxel, options, 1).into_iter().next()
+}
+
+/// The proposals around which clusters are sought: those of most evidence, and those that are most to be feared as rivals. Ascending.
+fn centres(proposals: &[Proposal]) -> BTreeSet<usize> {
+    let mut by_doubt: Vec<usize> = (0..proposals.len()).collect();
+    by_doubt.sort_by(|x, y| proposals[*y].doubt.total_cmp(&proposals[*x].doubt).then(x.cmp(y)));
+    (0..proposals.len().min(MAX_CENTRES)).chain(by_doubt.into_iter().take(MAX_CENTRES / 2)).collect()
+}
+
+fn decided(join: &DecidedJoin, graph: &ScanGraph, b: &Component) -> Candidate {
+    let place = |pose: &Pose| graph.scan(join.in_b).map(|scan| pose.transform(&scan.centroid));
+    let member = Proposal {
+        a_from_b: join.a_from_b,
+        in_a: join.in_a,
+        in_b: join.in_b,
+        in_a_from_in_b: join.in_a_from_in_b,
+        evidence: DECIDED,
+        doubt: DECIDED,
+        centroid: b.poses.get(&join.in_b).and_then(place).unwrap_or_default(),
     };
-    let rival = clusters
-        .iter()
-        .filter(|(_, c)| differs(&proposals[*c]))
-        .map(|(support, _)| *support)
-        .fold(0.0, f64::max);
-    let members = members(&proposals, centre, options.cluster_angle, reach).copied().collect();
-    Some(Candidate { a_from_b: best.a_from_b, support, rival, members })
+    Candidate { a_from_b: join.a_from_b, support: DECIDED, rival: 0.0, members: vec![member], decided: true }
 }
 
 /// The support that edges between two components give to a pose that is already known.
@@ -144,9 +215,16 @@ fn members(proposals: &[Proposal], centre: usize, angle: f64, reach: f64) -> imp
 
 /// The first proposal of each edge in the order given. Proposals come strongest first.
 fn best_by_edge<'p>(proposals: impl Iterator<Item = &'p Proposal>) -> impl Iterator<Item = &'p Proposal> {
-    let mut seen = std::collections::BTreeSet::new();
+    let mut seen = BTreeSet::new();
     let kept: Vec<&Proposal> = proposals.filter(|p| seen.insert((p.in_a, p.in_b))).collect();
     kept.into_iter()
+}
+
+/// Whether a pose between two components agrees with a proposal. `voxel` in metres.
+#[must_use]
+pub fn near(a_from_b: &Pose, proposal: &Proposal, voxel: f64, options: &MappingOptions) -> bool {
+    let reach = options.cluster_voxels * voxel;
+    agree(a_from_b, &proposal.a_from_b, &proposal.centroid, options.cluster_angle, reach)
 }
 
 fn within(x: &Proposal, y: &Proposal, angle: f64, reach: f64) -> bool {

@@ -3,12 +3,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::candidates::DECIDED;
 use super::component::Component;
 use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 use crate::graph::{Edge, ScanGraph, softplus};
-use crate::pairwise::centred_difference;
+use crate::pairwise::{PairKey, centred_difference};
 
 /// An adjustment threw a scan when it keeps less than this share of its support …
 const KEPT_SHARE: f64 = 0.5;
@@ -30,7 +31,7 @@ pub fn edge_support(graph: &ScanGraph, edge: &Edge, a_from_b: &Pose, options: &M
         .fold(0.0, f64::max)
 }
 
-/// Support between all pairs of a component's scans at its poses; pairs without any are left out.
+/// Support between all pairs of a component's scans at its poses; pairs without any are left out. What a client joined is firm.
 #[must_use]
 pub fn supports(
     graph: &ScanGraph,
@@ -47,6 +48,11 @@ pub fn supports(
             if support > 0.0 {
                 found.insert((*a, b), support);
             }
+        }
+    }
+    for pair in options.decisions.joined_pairs() {
+        if component.poses.contains_key(&pair.a) && component.poses.contains_key(&pair.b) {
+            found.insert((pair.a, pair.b), DECIDED);
         }
     }
     found
@@ -141,6 +147,86 @@ pub fn weakest_cut(
     let side =
         if 2 * side.len() > n { keys.into_iter().filter(|key| !side.contains(key)).collect() } else { side };
     Some((side, cut))
+}
+
+/// A pair says that much by itself (softplus of its log-odds) when it counts as a witness: a likelihood of 0.86.
+const WITNESS: f64 = 2.0;
+/// A component is contradicted when this share of its witnesses speak against it …
+const CONTRADICTED_SHARE: f64 = 0.04;
+/// … and at least this many.
+const CONTRADICTED_PAIRS: usize = 3;
+
+/// A pair of scans in one component whose own evidence is for another pose than the one they have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Contradiction {
+    /// Which pair.
+    pub pair: PairKey,
+    /// softplus of the log-odds of the other pose, by the pair alone.
+    pub evidence: f64,
+    /// Angle between the two poses, radians.
+    pub angle: f64,
+    /// How far apart they put the centroid of the pair's second scan, metres.
+    pub distance: f64,
+}
+
+/// What pairs say by themselves of a component's poses. Third scans are not asked: where rooms are alike, they repeat what is wrong
+/// until it drowns what is right.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Testimony {
+    /// Pairs that are sure of the pose they have.
+    pub agreeing: usize,
+    /// Pairs that are sure of another, the surest first.
+    pub contradictions: Vec<Contradiction>,
+}
+
+impl Testimony {
+    /// Whether too many witnesses speak against the component for it to be right. Chance makes about one in a hundred; folding
+    /// alike rooms onto each other makes one in three.
+    #[must_use]
+    pub fn condemns(&self) -> bool {
+        let against = self.contradictions.len();
+        against >= CONTRADICTED_PAIRS
+            && against as f64 >= CONTRADICTED_SHARE * (self.agreeing + against) as f64
+    }
+}
+
+/// Asks every pair of a component's scans. Pairs that a client decided about are not asked.
+#[must_use]
+pub fn testimony(graph: &ScanGraph, component: &Component, options: &MappingOptions) -> Testimony {
+    let mut found = Testimony::default();
+    for (a, model_from_a) in &component.poses {
+        for b in graph.neighbors(*a).filter(|b| b > a) {
+            let (Some(model_from_b), Some(edge), Some(scan)) =
+                (component.poses.get(&b), graph.edge(*a, b), graph.scan(b))
+            else {
+                continue;
+            };
+            if options.decisions.concern(edge.pair) {
+                continue;
+            }
+            let now = model_from_a.inverse() * *model_from_b;
+            let reach = options.rival_voxels * scan.prepared.resolution;
+            let mut agreeing = 0.0_f64;
+            let mut other: Option<Contradiction> = None;
+            for h in &edge.hypotheses {
+                let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, &now, &scan.centroid);
+                let evidence = softplus(h.hypothesis.logit);
+                if angle < options.rival_angle && distance < reach {
+                    agreeing = agreeing.max(evidence).max(softplus(h.score));
+                } else if other.is_none_or(|known| evidence > known.evidence) {
+                    other = Some(Contradiction { pair: edge.pair, evidence, angle, distance });
+                }
+            }
+            match other {
+                Some(other) if other.evidence > WITNESS && other.evidence > agreeing => {
+                    found.contradictions.push(other);
+                }
+                _ => found.agreeing += usize::from(agreeing > WITNESS),
+            }
+        }
+    }
+    found.contradictions.sort_by(|x, y| y.evidence.total_cmp(&x.evidence).then(x.pair.cmp(&y.pair)));
+    found
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use nalgebra::Vector3;
 
-use super::candidates::{Candidate, support_of};
+use super::candidates::{Candidate, near, support_of};
 use super::component::Component;
 use super::options::{JoinLevel, MappingOptions};
 use super::surfaces::{align, judge};
@@ -31,6 +31,13 @@ pub enum Refusal {
         support: f64,
         /// Support of the rival.
         rival: f64,
+    },
+    /// Too many pairs speak against where the scan was: alike places were taken for one.
+    Contradicted {
+        /// Pairs that are sure of another pose.
+        against: usize,
+        /// Pairs that were sure of this one.
+        agreeing: usize,
     },
     /// Surfaces in free space.
     Violation {
@@ -68,6 +75,10 @@ pub fn verify_join(
 ) -> Result<Pose, Refusal> {
     let pooled = pooled_fit(graph, a, b, candidate, voxel);
     let aligned = align(graph, a, b, &pooled, voxel);
+    if candidate.decided {
+        let agrees = candidate.members.iter().all(|m| near(&aligned, m, voxel, options));
+        return Ok(if agrees { aligned } else { candidate.a_from_b });
+    }
     // The alignment must stay at the pose that the edges voted for.
     let kept = support_of(graph, a, b, &aligned, voxel, options);
     if kept < level.support {

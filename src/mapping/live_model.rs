@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::component::Component;
+use super::decision::{Decision, Decisions};
 use super::mapper::Mapper;
 use super::options::MappingOptions;
 use super::policy::grow;
@@ -82,6 +83,9 @@ impl LiveModel {
             }
         }
         model.mapper.joins_since_refinement = snapshot.joins_since_refinement;
+        model.mapper.open_joins.clone_from(&snapshot.open_joins);
+        model.mapper.undone.clone_from(&snapshot.undone);
+        model.options.decisions.clone_from(&snapshot.decisions);
         Ok(model)
     }
 
@@ -107,9 +111,29 @@ impl LiveModel {
         Ok(())
     }
 
+    /// Obeys these decisions from now on, instead of any earlier ones: the components that they concern are decided anew. On `Err`
+    /// the model is unchanged.
+    pub fn decide(&mut self, decisions: &[Decision], control: Control<'_>) -> Result<(), Cancelled> {
+        let mut next = self.clone();
+        next.options.decisions = Decisions::new(decisions);
+        let old = self.options.decisions.as_slice();
+        let new = next.options.decisions.as_slice();
+        let changed = old.iter().filter(|d| !new.contains(d)).chain(new.iter().filter(|d| !old.contains(d)));
+        let concerned: BTreeSet<ScanKey> = changed.flat_map(|d| [d.pair.a, d.pair.b]).collect();
+        if concerned.is_empty() {
+            return Ok(());
+        }
+        next.mapper.reopen(&concerned);
+        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options);
+        next.grow(control)?;
+        *self = next;
+        Ok(())
+    }
+
     /// Takes a scan out of the model with its edges and observations. Returns whether it was there.
     pub fn remove(&mut self, key: ScanKey) -> bool {
         self.mapper.remove(key, &self.options);
+        self.options.decisions.remove_scan(key);
         self.new_pairs.retain(|p| p.pair.a != key && p.pair.b != key);
         let there = self.graph.remove_scan(key, &self.options.support);
         self.mapper.sort_components();
@@ -173,6 +197,9 @@ impl LiveModel {
             resolution: self.voxel(),
             refusals: refusals.collect(),
             joins_since_refinement: self.mapper.joins_since_refinement,
+            open_joins: self.mapper.open_joins.clone(),
+            undone: self.mapper.undone.clone(),
+            decisions: self.options.decisions.clone(),
             ..ModelSnapshot::default()
         };
         for (index, component) in self.mapper.components.iter().enumerate() {

@@ -8,6 +8,7 @@ use super::consistency::{supports, thrown, weakest_cut};
 use super::initial_pair::initial_pairs;
 use super::join::{Refusal, check_support, verify_join};
 use super::next_scan::visible_landmarks;
+use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{dense, local_bundle_adjustment, neighborhood, pose_graph};
 use super::snapshot::WaitingReason;
@@ -41,6 +42,12 @@ pub struct Mapper {
     filtered: BTreeMap<ScanKey, usize>,
     /// Joins since the whole model was refined last.
     pub joins_since_refinement: usize,
+    /// Scans of components that were taken apart because their pairs contradict each other.
+    pub(super) doubted: BTreeSet<ScanKey>,
+    /// Placements taken back since the model was last decided anew.
+    pub undone: Vec<Undone>,
+    /// Joins not made although something speaks for them, as of the end of growing.
+    pub open_joins: Vec<OpenJoin>,
 }
 
 /// A scan is filtered at most this often while the model does not forget.
@@ -66,6 +73,8 @@ impl Mapper {
     pub fn remove(&mut self, scan: ScanKey, options: &MappingOptions) {
         self.waiting.remove(&scan);
         self.filtered.remove(&scan);
+        self.doubted.remove(&scan);
+        self.open_joins.retain(|open| open.a != scan && open.b != scan);
         self.refused.retain(|(x, y), _| *x != scan && *y != scan);
         for component in &mut self.components {
             component.remove(scan, options);
@@ -123,8 +132,7 @@ impl Mapper {
         options: &MappingOptions,
     ) -> Vec<NextScan> {
         let mut ranked = Vec::new();
-        let waiting: Vec<ScanKey> = self.waiting.keys().copied().collect();
-        for scan in waiting {
+        for scan in self.free() {
             let single = Component::single(scan);
             for (index, component) in self.components.iter().enumerate() {
                 let Some(candidate) = best_candidate(graph, component, &single, voxel, options) else {
@@ -161,7 +169,7 @@ impl Mapper {
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<bool, Cancelled> {
-        let free: BTreeSet<ScanKey> = self.waiting.keys().copied().collect();
+        let free = self.free();
         for (first, second) in initial_pairs(graph, &free, level, options) {
             control.check()?;
             let (mut a, b) = (Component::single(first), Component::single(second));
@@ -339,8 +347,38 @@ impl Mapper {
         }
         self.refused.clear();
         self.filtered.clear();
+        self.doubted.clear();
+        self.undone.clear();
         self.dissolve_small();
         self.sort_components();
+    }
+
+    /// Waiting scans that may be joined.
+    fn free(&self) -> BTreeSet<ScanKey> {
+        self.waiting.keys().filter(|scan| !self.doubted.contains(scan)).copied().collect()
+    }
+
+    /// Takes apart the components that hold any of these scans: what was decided about them decides all of it anew.
+    pub fn reopen(&mut self, scans: &BTreeSet<ScanKey>) {
+        let (touched, kept): (Vec<Component>, Vec<Component>) = std::mem::take(&mut self.components)
+            .into_iter()
+            .partition(|c| c.poses.keys().any(|scan| scans.contains(scan)));
+        self.components = kept;
+        for scan in touched.into_iter().flat_map(|c| c.poses.into_keys()) {
+            self.add_waiting(scan);
+        }
+    }
+
+    /// Lists the joins that are left open.
+    pub fn list_open_joins(
+        &mut self,
+        graph: &ScanGraph,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<(), Cancelled> {
+        self.open_joins = open_joins(graph, &self.components, &self.waiting, voxel, options, control)?;
+        Ok(())
     }
 
     /// Whether the model has grown enough since the last refinement to deserve another.
@@ -374,6 +412,9 @@ impl Mapper {
             }
             Some(Refusal::Violation { found, allowed }) => {
                 WaitingReason::ViolatesFreeSpace { violation: found, allowed }
+            }
+            Some(Refusal::Contradicted { against, agreeing }) => {
+                WaitingReason::Contradicted { against, agreeing }
             }
             Some(Refusal::Support { found, .. }) => {
                 WaitingReason::NoVerifiedPair { tried, best_support: found, needed }
@@ -438,7 +479,8 @@ fn guarded(
 fn worse(known: Option<Refusal>, new: Refusal) -> Option<Refusal> {
     match (known, new) {
         (Some(Refusal::Support { found, .. }), Refusal::Support { found: now, .. }) if now < found => known,
-        (Some(Refusal::Violation { .. } | Refusal::Rival { .. }), Refusal::Support { .. }) => known,
+        (Some(Refusal::Contradicted { .. }), _)
+        | (Some(Refusal::Violation { .. } | Refusal::Rival { .. }), Refusal::Support { .. }) => known,
         _ => Some(new),
     }
 }

@@ -9,11 +9,13 @@
 mod candidates;
 mod component;
 mod consistency;
+mod decision;
 mod initial_pair;
 mod join;
 mod live_model;
 mod mapper;
 mod next_scan;
+mod open_join;
 mod options;
 mod policy;
 mod refine;
@@ -21,8 +23,12 @@ mod snapshot;
 mod surfaces;
 mod track_refinement;
 mod tracks;
+mod undo;
 
+pub use decision::{Decision, Decisions, Verdict};
+pub use join::Refusal;
 pub use live_model::{LiveModel, RefinementReport, RestoreError};
+pub use open_join::{OpenJoin, RivalPose, Undone};
 pub use options::{JoinLevel, MappingOptions};
 pub use snapshot::{ComponentSnapshot, ModelSnapshot, RegisteredScan, ScanOutcome, WaitingReason};
 pub use tracks::{Landmark, TrackObservation, Tracks, aggregate, aggregate_robustly};

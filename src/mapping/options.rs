@@ -3,6 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::decision::Decisions;
 use crate::control::Seed;
 use crate::graph::SupportOptions;
 
@@ -58,6 +59,8 @@ pub struct MappingOptions {
     pub refine_growth: f64,
     /// … and by at least this many joins.
     pub refine_joins: usize,
+    /// What clients decided; every join obeys.
+    pub decisions: Decisions,
 }
 
 impl Default for MappingOptions {
@@ -87,6 +90,7 @@ impl Default for MappingOptions {
             local_neighbors: 5,
             refine_growth: 0.1,
             refine_joins: 4,
+            decisions: Decisions::default(),
         }
     }
 }

@@ -25,7 +25,7 @@ pub fn grow(
     let mut rounds = 0;
     loop {
         join_all(mapper, graph, voxel, options, control)?;
-        if mapper.filter_scans(graph, voxel, options) > 0 {
+        if mapper.filter_scans(graph, voxel, options) > 0 || mapper.undo_contradicted(graph, options) > 0 {
             continue;
         }
         let fresh: BTreeSet<_> =
@@ -40,7 +40,7 @@ pub fn grow(
         mapper.refine(graph, voxel, options, control)?;
     }
     mapper.sort_components();
-    Ok(())
+    mapper.list_open_joins(graph, voxel, options, control)
 }
 
 /// Makes joins, strictest level first, until no level makes any.

@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::component::Component;
+use super::decision::Decisions;
 use super::join::Refusal;
+use super::open_join::{OpenJoin, Undone};
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 
@@ -30,6 +32,14 @@ pub enum WaitingReason {
         best_support: f64,
         /// Support of the best different pose.
         rival_support: f64,
+    },
+    /// It was placed, and then too many pairs were sure of other poses: alike places were taken for one. A decision, or a scan that
+    /// tells the places apart, helps.
+    Contradicted {
+        /// Pairs that are sure of another pose.
+        against: usize,
+        /// Pairs that were sure of this one.
+        agreeing: usize,
     },
     /// The best candidate pose puts surfaces where another scan saw free space.
     ViolatesFreeSpace {
@@ -113,6 +123,12 @@ pub struct ModelSnapshot {
     pub components: Vec<ComponentSnapshot>,
     /// Every scan of the model.
     pub scans: BTreeMap<ScanKey, ScanOutcome>,
+    /// Joins that were not made although something speaks for them, the best supported first.
+    pub open_joins: Vec<OpenJoin>,
+    /// Placements that later evidence contradicted, and that this version took back.
+    pub undone: Vec<Undone>,
+    /// What clients decided, and this model obeys.
+    pub decisions: Decisions,
     /// Why waiting scans were refused, to go on from.
     pub(super) refusals: BTreeMap<ScanKey, Refusal>,
     /// Joins since the last refinement, to go on from.
