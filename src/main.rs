@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use cairn::cli::{demo, evaluate, openapi, register, serve, simulate};
+use cairn::cli::{bench, demo, evaluate, openapi, register, serve, simulate};
 
 /// Fits many 3-D scans of one place into one model
 #[derive(Debug, Parser)]
@@ -20,6 +20,7 @@ enum Command {
     Register(register::RegisterArgs),
     Demo(demo::DemoArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Bench(bench::BenchArgs),
     Simulate(simulate::SimulateArgs),
     Openapi(openapi::OpenapiArgs),
 }
@@ -37,6 +38,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Register(args) => return register::run(&args),
         Command::Demo(args) => return demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args)?,
+        Command::Bench(args) => bench::run(&args)?,
         Command::Simulate(args) => simulate::run(&args)?,
         Command::Openapi(args) => openapi::run(args)?,
     }

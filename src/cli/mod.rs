@@ -1,5 +1,6 @@
 //! The command line: one file or folder a subcommand.
 
+pub mod bench;
 pub mod demo;
 pub mod evaluate;
 pub mod openapi;

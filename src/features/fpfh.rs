@@ -2,6 +2,7 @@
 //! in the Hellinger form: square-rooted and normalised, so that the dot product of two descriptors is the
 //! Bhattacharyya coefficient of their histograms, between 0 and 1.
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::geometry::{NeighborIndex, Point};
@@ -40,13 +41,7 @@ pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor>
         .par_iter()
         .enumerate()
         .map(|(me, near)| {
-            let mut sum = [0.0; DESCRIPTOR_LEN];
-            for &(other, square) in near {
-                let weight = 1.0 / square;
-                for (total, x) in sum.iter_mut().zip(&simple[other as usize]) {
-                    *total += weight * x;
-                }
-            }
+            let mut sum = weighted_sum(near, &simple);
             normalise_histograms(&mut sum);
             for (total, x) in sum.iter_mut().zip(&simple[me]) {
                 *total += x;
@@ -56,44 +51,125 @@ pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor>
         .collect()
 }
 
+/// The sum of the neighbours' histograms, each weighted by its inverse squared distance.
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn weighted_sum(near: &[(u32, f32)], simple: &[Descriptor]) -> Descriptor {
+    let mut sum = [0.0; DESCRIPTOR_LEN];
+    for &(other, square) in near {
+        let weight = 1.0 / square;
+        for (total, x) in sum.iter_mut().zip(&simple[other as usize]) {
+            *total += weight * x;
+        }
+    }
+    sum
+}
+
 /// The SPFH of one point: angles between its normal, its neighbours' normals and the lines between them.
 fn simplified_histogram(me: usize, near: &[(u32, f32)], points: &[Point], normals: &[Point]) -> Descriptor {
-    let mut histogram = [0.0; DESCRIPTOR_LEN];
-    for &(other, square) in near {
-        let other = other as usize;
-        let inverse = square.sqrt().recip();
-        let d: Point = std::array::from_fn(|k| (points[other][k] - points[me][k]) * inverse);
-        let Some([alpha, phi, theta]) = pair_features(&d, &normals[me], &normals[other]) else { continue };
-        histogram[bin(alpha)] += 1.0;
-        histogram[BINS + bin(phi)] += 1.0;
-        histogram[2 * BINS + bin(theta * std::f32::consts::FRAC_1_PI)] += 1.0;
+    // The last entry takes what has no angles.
+    let mut counts = [0.0; DESCRIPTOR_LEN + 1];
+    let mut block = Neighbors::default();
+    for near in near.chunks(LANES) {
+        for (lane, &(other, square)) in near.iter().enumerate() {
+            let other = other as usize;
+            for k in 0..3 {
+                block.offset[k][lane] = points[other][k] - points[me][k];
+                block.normal[k][lane] = normals[other][k];
+            }
+            block.square[lane] = square;
+        }
+        pair_bins(&normals[me], &mut block);
+        for bins in &block.bins {
+            for bin in &bins[..near.len()] {
+                counts[(*bin as usize).min(DESCRIPTOR_LEN)] += 1.0;
+            }
+        }
     }
+    let mut histogram = std::array::from_fn(|k| counts[k]);
     normalise_histograms(&mut histogram);
     histogram
 }
 
-/// The three angles of a Darboux frame, as (sine-like, sine-like, radians). `d` is the unit vector from the first to the second
-/// point. The point whose normal is closer to the line is the source, as in the paper.
-fn pair_features(d: &Point, first: &Point, second: &Point) -> Option<[f32; 3]> {
-    let (along_first, along_second) = (dot(first, d), dot(second, d));
-    let (u, target, d, phi) = if along_first.abs() >= along_second.abs() {
-        (first, second, *d, along_first)
-    } else {
-        (second, first, d.map(|x| -x), -along_second)
-    };
-    let v = cross(&d, u);
-    let length = dot(&v, &v).sqrt();
-    if length < 1e-6 {
-        return None;
+/// Neighbours of a point that are taken together.
+const LANES: usize = 16;
+
+/// Some neighbours of a point, one array a coordinate.
+#[derive(Default)]
+struct Neighbors {
+    /// From the point to them, metres.
+    offset: [[f32; LANES]; 3],
+    /// Square of that distance, square metres.
+    square: [f32; LANES],
+    normal: [[f32; LANES]; 3],
+    /// The result: the numbers of the descriptor that the three angles of each fall into, or [`DESCRIPTOR_LEN`] for none.
+    bins: [[u32; LANES]; 3],
+}
+
+/// The three angles of a Darboux frame, of each neighbour, as bins. The point whose normal is closer to the line between
+/// both is the source, as in the paper.
+///
+/// With d the unit line from source to target, u the source's normal and t the target's, v = d x u / |d x u| and w = u x v: the
+/// angles are v . t, d . u, and atan2(w . t, u . t). The triple product in v . t is the same whichever point is the source.
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn pair_bins(mine: &Point, block: &mut Neighbors) {
+    let [mx, my, mz] = *mine;
+    let ([ox, oy, oz], [nx, ny, nz]) = (&block.offset, &block.normal);
+    for k in 0..LANES {
+        let inverse = 1.0 / block.square[k].sqrt();
+        let (dx, dy, dz) = (ox[k] * inverse, oy[k] * inverse, oz[k] * inverse);
+        let along_mine = mx * dx + my * dy + mz * dz;
+        let along_other = nx[k] * dx + ny[k] * dy + nz[k] * dz;
+        let from_mine = along_mine.abs() >= along_other.abs();
+        let (phi, along_target) =
+            if from_mine { (along_mine, along_other) } else { (-along_other, -along_mine) };
+        let (ux, uy, uz) = if from_mine { (mx, my, mz) } else { (nx[k], ny[k], nz[k]) };
+        let (vx, vy, vz) = (dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux);
+        let length = (vx * vx + vy * vy + vz * vz).sqrt();
+        let triple = (dy * mz - dz * my) * nx[k] + (dz * mx - dx * mz) * ny[k] + (dx * my - dy * mx) * nz[k];
+        let between = mx * nx[k] + my * ny[k] + mz * nz[k];
+        // w . t = (d - u (d . u)) . t / |d x u|
+        let theta = half_turns((along_target - phi * between) / length, between);
+        let determined = length >= 1e-6;
+        let angles = [triple / length, phi, theta];
+        for (part, angle) in angles.into_iter().enumerate() {
+            let bin = (part * BINS) as u32 + bin(angle);
+            block.bins[part][k] = if determined { bin } else { DESCRIPTOR_LEN as u32 };
+        }
     }
-    let v = v.map(|x| x / length);
-    let w = cross(u, &v);
-    Some([dot(&v, target), phi, dot(&w, target).atan2(dot(u, target))])
 }
 
 /// The bin of a value in [-1, 1].
-fn bin(value: f32) -> usize {
-    (((value + 1.0) * 0.5 * BINS as f32) as usize).min(BINS - 1)
+#[inline]
+fn bin(value: f32) -> u32 {
+    ((value + 1.0) * 0.5 * BINS as f32).clamp(0.0, BINS as f32 - 1.0) as u32
+}
+
+/// atan2(y, x) / pi to within 1e-6, in arithmetic that runs on many numbers at once.
+#[inline]
+fn half_turns(y: f32, x: f32) -> f32 {
+    // A polynomial of atan(r) / (pi r) in the square of r, whose largest error on [0, 1] is the least possible.
+    const ARCTANGENT: [f32; 8] = [
+        0.318_309_66,
+        -0.106_092_244,
+        0.063_491_89,
+        -0.044_272_542,
+        0.030_692_069,
+        -0.017_797_446,
+        0.006_959_195,
+        -0.001_290_608_4,
+    ];
+    let (ax, ay) = (x.abs(), y.abs());
+    let (low, high) = if ax < ay { (ax, ay) } else { (ay, ax) };
+    let ratio = if high > 0.0 { low / high } else { 0.0 };
+    let square = ratio * ratio;
+    let mut value = ARCTANGENT[7];
+    for coefficient in ARCTANGENT[..7].iter().rev() {
+        value = value * square + coefficient;
+    }
+    let first = value * ratio;
+    let steep = if ax < ay { 0.5 - first } else { first };
+    let upper = if x < 0.0 { 1.0 - steep } else { steep };
+    if y < 0.0 { -upper } else { upper }
 }
 
 fn normalise_histograms(descriptor: &mut Descriptor) {
@@ -111,14 +187,6 @@ fn hellinger(descriptor: Descriptor) -> Descriptor {
     let root = descriptor.map(f32::sqrt);
     let norm = root.iter().map(|x| x * x).sum::<f32>().sqrt();
     if norm > 0.0 { root.map(|x| x / norm) } else { root }
-}
-
-fn dot(a: &Point, b: &Point) -> f32 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn cross(a: &Point, b: &Point) -> Point {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[cfg(test)]
@@ -153,6 +221,40 @@ mod tests {
             assert!((a.iter().map(|x| x * x).sum::<f32>() - 1.0).abs() < 1e-5);
             assert!(same > 0.98, "{same}");
         }
+    }
+
+    #[test]
+    fn angles_are_angles() {
+        for i in 0..720 {
+            let angle = f64::from(i).to_radians() * 0.5 - std::f64::consts::PI + 0.001;
+            let found = half_turns(3.0 * angle.sin() as f32, 3.0 * angle.cos() as f32);
+            assert!((f64::from(found) - angle / std::f64::consts::PI).abs() < 1e-6, "{angle}");
+        }
+        assert_eq!(half_turns(0.0, 0.0), 0.0);
+    }
+
+    #[test]
+    fn the_bins_are_those_of_the_darboux_frame() {
+        let mine = Vector3::<f32>::new(0.1, 0.2, 0.97).normalize();
+        let other = Vector3::<f32>::new(-0.4, 0.3, 0.8).normalize();
+        let line = Vector3::<f32>::new(0.3, -0.1, 0.05);
+        // The other normal is closer to the line, so that point is the source and the line runs from it to the first.
+        let (u, target, d) = (other, mine, -line.normalize());
+        assert!(u.dot(&d).abs() > target.dot(&d).abs());
+        let v = d.cross(&u).normalize();
+        let w = u.cross(&v);
+        let theta = w.dot(&target).atan2(u.dot(&target)) / std::f32::consts::PI;
+        let expected = [v.dot(&target), u.dot(&d), theta].map(bin);
+
+        let mut block = Neighbors::default();
+        for k in 0..3 {
+            block.offset[k][0] = line[k];
+            block.normal[k][0] = other[k];
+        }
+        block.square[0] = line.norm_squared();
+        pair_bins(&mine.into(), &mut block);
+        let found: [u32; 3] = std::array::from_fn(|k| block.bins[k][0] - (k * BINS) as u32);
+        assert_eq!(found, expected);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! What a sensor saw, as a cube map of depths: six pinhole faces around the sensor, so that a depth camera and a
 //! panoramic scanner are the same code and no direction is special.
 
+use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Point;
@@ -110,6 +111,77 @@ impl RangeImage {
             Visibility::OnSurface
         }
     }
+
+    /// How many of many points [`RangeImage::judge`] finds in front of what was seen, and how many on it. Points are given as one
+    /// array a coordinate, in the scan's frame, metres.
+    #[must_use]
+    pub fn judge_all(&self, points: [&[f32]; 3]) -> (u32, u32) {
+        let (mut in_front, mut on_surface) = (0, 0);
+        let mut pixels = Pixels::default();
+        for first in (0..points[0].len()).step_by(Pixels::MOST) {
+            let last = (first + Pixels::MOST).min(points[0].len());
+            let [x, y, z] = points.map(|axis| &axis[first..last]);
+            find_pixels(x, y, z, &self.sensor, self.pixel, &mut pixels);
+            for i in 0..last - first {
+                let depth = pixels.depth[i];
+                let seen = self.faces[pixels.face[i] as usize % 6].depth(pixels.column[i], pixels.row[i]);
+                let margin = self.margin + MARGIN_PIXELS * self.pixel * depth;
+                let known = (seen > 0.0) && (depth > 0.0);
+                let before = depth < seen - margin;
+                let behind = depth > seen + margin;
+                in_front += u32::from(known && before);
+                on_surface += u32::from(known && !before && !behind);
+            }
+        }
+        (in_front, on_surface)
+    }
+}
+
+/// Where some points are in the range image: the results of [`project`], one array each. Depth 0 is a point that has no place.
+struct Pixels {
+    face: [u32; Self::MOST],
+    column: [u32; Self::MOST],
+    row: [u32; Self::MOST],
+    depth: [f32; Self::MOST],
+}
+
+impl Pixels {
+    const MOST: usize = 256;
+}
+
+impl Default for Pixels {
+    fn default() -> Self {
+        let none = [0; Self::MOST];
+        Self { face: none, column: none, row: none, depth: [0.0; Self::MOST] }
+    }
+}
+
+/// [`project`] without branches, so that it runs on many points at once.
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn find_pixels(x: &[f32], y: &[f32], z: &[f32], sensor: &Point, width: f32, pixels: &mut Pixels) {
+    let n = x.len().min(Pixels::MOST);
+    let (x, y, z) = (&x[..n], &y[..n], &z[..n]);
+    let (faces, columns) = (&mut pixels.face[..n], &mut pixels.column[..n]);
+    let (rows, depths) = (&mut pixels.row[..n], &mut pixels.depth[..n]);
+    for i in 0..n {
+        let (dx, dy, dz) = (x[i] - sensor[0], y[i] - sensor[1], z[i] - sensor[2]);
+        let (sx, sy, sz) = (dx.abs(), dy.abs(), dz.abs());
+        let on_x = (sx >= sy) && (sx >= sz);
+        let on_y = !on_x && (sy >= sz);
+        let (along, u, v, axis) = if on_x {
+            (dx, dy, dz, 0)
+        } else if on_y {
+            (dy, dz, dx, 2)
+        } else {
+            (dz, dx, dy, 4)
+        };
+        let depth = along.abs();
+        let valid = (depth > 1e-9) && (depth < f32::INFINITY);
+        faces[i] = axis + u32::from(along < 0.0);
+        columns[i] = ((u / depth + HALF_WIDTH) / width) as u32;
+        rows[i] = ((v / depth + HALF_WIDTH) / width) as u32;
+        depths[i] = if valid { depth } else { 0.0 };
+    }
 }
 
 impl Face {
@@ -210,6 +282,27 @@ mod tests {
         assert_eq!(image.judge(&[-1.0, 0.0, 0.0]), Visibility::Unknown);
         assert_eq!(image.judge(&[2.0, 1.9, 0.0]), Visibility::Unknown);
         assert_eq!(image.judge(&[f32::NAN, 0.0, 0.0]), Visibility::Unknown);
+    }
+
+    #[test]
+    fn many_points_at_once_are_judged_as_each_alone() {
+        let points: Vec<Point> = (0..700)
+            .map(|i| [0.01 * i as f32 - 1.0, (i % 7) as f32 * 0.2 - 0.5, (i % 11) as f32 - 0.1])
+            .collect();
+        let (ball, _) = RangeImage::render(&points, [0.1, 0.2, 0.3], 0.3);
+        let axis =
+            |k: usize| -> Vec<f32> { points.iter().map(|p| p[k] * 0.9).chain([f32::NAN, 0.1]).collect() };
+        let axes = [axis(0), axis(1), axis(2)];
+        let mut some = 0;
+        for image in [wall(), ball] {
+            let single: Vec<_> =
+                (0..points.len() + 2).map(|i| image.judge(&[axes[0][i], axes[1][i], axes[2][i]])).collect();
+            let count = |kind| single.iter().filter(|seen| **seen == kind).count() as u32;
+            let all = image.judge_all([&axes[0], &axes[1], &axes[2]]);
+            assert_eq!(all, (count(Visibility::InFront), count(Visibility::OnSurface)));
+            some += all.0;
+        }
+        assert!(some > 0);
     }
 
     #[test]

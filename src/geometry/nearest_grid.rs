@@ -1,16 +1,23 @@
 //! "Which point is nearest to here, if any is near?" in constant time: a grid of cells of one voxel, each holding the
-//! nearest point within three cells. Cells live in bricks of 8 x 8 x 8, and only bricks near points exist.
+//! nearest point within three cells. Cells live in bricks of 8 x 8 x 8, and only bricks near points exist: all others, and the
+//! whole outside, are one brick without points, so that a lookup is two loads and no branch.
+
+use multiversion::multiversion;
 
 use super::Point;
 use super::voxel_grid::cell_of;
 
-const BRICK: i64 = 8;
+/// Cells along the edge of a brick, as a power of two.
+const BRICK_BITS: u32 = 3;
+const BRICK: i64 = 1 << BRICK_BITS;
 const BRICK_CELLS: usize = (BRICK * BRICK * BRICK) as usize;
+/// What a cell without a near point holds.
 const EMPTY: u32 = u32::MAX;
 /// A cell knows the nearest point up to this many cells away.
 const REACH: i64 = 3;
-/// Top-level bricks at most, so that a stray point far away cannot make the table huge (64 MiB of it).
-const MAX_BRICKS: usize = 1 << 24;
+/// Top-level bricks at most, so that a stray point far away cannot make the table huge (16 MiB of it), and that the number of a
+/// brick and that of a cell in it fit into one word.
+const MAX_BRICKS: usize = 1 << 22;
 
 /// Constant-time lookup of a near point. Built once per scan.
 #[derive(Debug, Clone)]
@@ -20,8 +27,9 @@ pub struct NearestGrid {
     low: [i64; 3],
     /// Bricks along each axis.
     bricks: [i64; 3],
-    /// Index of each brick in `cells`, or EMPTY.
+    /// Where the cells of each brick are, in bricks of `cells`; one more entry than bricks, for the outside. 0 is the empty brick.
     table: Vec<u32>,
+    /// The near point of each cell, brick after brick, or EMPTY.
     cells: Vec<u32>,
 }
 
@@ -32,17 +40,23 @@ impl NearestGrid {
     pub fn new(points: &[Point], size: f32) -> Self {
         let cells: Vec<[i64; 3]> = points.iter().map(|p| cell_of(p, size)).collect();
         let Some((low, high)) = bounds(&cells) else {
-            return Self { size, low: [0; 3], bricks: [0; 3], table: Vec::new(), cells: Vec::new() };
+            return Self {
+                size,
+                low: [0; 3],
+                bricks: [0; 3],
+                table: vec![0],
+                cells: vec![EMPTY; BRICK_CELLS],
+            };
         };
         let bricks: [i64; 3] = std::array::from_fn(|k| (high[k] - low[k]) / BRICK + 1);
         let mut grid = Self {
             size,
             low,
             bricks,
-            table: vec![EMPTY; bricks.iter().product::<i64>() as usize],
-            cells: Vec::new(),
+            table: vec![0; bricks.iter().product::<i64>() as usize + 1],
+            cells: vec![EMPTY; BRICK_CELLS],
         };
-        let mut distances: Vec<f32> = Vec::new();
+        let mut distances: Vec<f32> = vec![f32::INFINITY; BRICK_CELLS];
         for (index, (cell, point)) in cells.iter().zip(points).enumerate() {
             if (0..3).all(|k| cell[k] - REACH >= low[k] && cell[k] + REACH <= high[k]) {
                 grid.spread(index as u32, *cell, point, &mut distances);
@@ -56,36 +70,57 @@ impl NearestGrid {
     #[inline]
     #[must_use]
     pub fn nearest(&self, point: &Point) -> Option<usize> {
-        let inverse = 1.0 / self.size;
-        let mut brick_index = 0_usize;
-        let mut inner = 0_usize;
-        for k in 0..3 {
-            let offset = ((point[k] * inverse).floor() as i64).saturating_sub(self.low[k]);
-            if offset < 0 || offset >= self.bricks[k] * BRICK {
-                return None;
-            }
-            brick_index = brick_index * self.bricks[k] as usize + (offset / BRICK) as usize;
-            inner = inner * BRICK as usize + (offset % BRICK) as usize;
-        }
-        let brick = self.table[brick_index];
-        if brick == EMPTY {
-            return None;
-        }
-        let index = self.cells[brick as usize * BRICK_CELLS + inner];
+        let index = self.lookup(place(&self.frame(), point[0], point[1], point[2]));
         (index != EMPTY).then_some(index as usize)
     }
 
+    /// [`NearestGrid::nearest`] for many points, given and answered as one array a coordinate, all of one length. Where no point is
+    /// near, `found` gets a number that no point has.
+    pub fn nearest_of_all(&self, [x, y, z]: [&[f32]; 3], found: &mut [u32]) {
+        places(&self.frame(), x, y, z, found);
+        for place in found {
+            *place = self.lookup(*place);
+        }
+    }
+
+    #[inline]
+    fn lookup(&self, place: u32) -> u32 {
+        let brick = self.table[place as usize / BRICK_CELLS] as usize;
+        self.cells[brick * BRICK_CELLS + place as usize % BRICK_CELLS]
+    }
+
+    #[inline]
+    fn frame(&self) -> Frame {
+        Frame {
+            inverse: 1.0 / self.size,
+            low: self.low.map(|x| x as f32),
+            cells: self.bricks.map(|x| (x * BRICK) as f32),
+            bricks: self.bricks.map(|x| x as u32),
+        }
+    }
+
+    /// Offers a point to all cells in reach of its own.
     fn spread(&mut self, index: u32, cell: [i64; 3], point: &Point, distances: &mut Vec<f32>) {
-        for x in cell[0] - REACH..=cell[0] + REACH {
-            let dx = (x as f32 + 0.5) * self.size - point[0];
-            for y in cell[1] - REACH..=cell[1] + REACH {
-                let dy = (y as f32 + 0.5) * self.size - point[1];
-                for z in cell[2] - REACH..=cell[2] + REACH {
-                    let dz = (z as f32 + 0.5) * self.size - point[2];
-                    let slot = self.slot([x, y, z], distances);
-                    let square = dx * dx + dy * dy + dz * dz;
-                    if square < distances[slot] {
-                        distances[slot] = square;
+        const WIDTH: usize = 2 * REACH as usize + 1;
+        let [_, ny, nz] = self.bricks;
+        let strides = [(ny * nz, 2 * BRICK_BITS), (nz, BRICK_BITS), (1, 0)];
+        let [along_x, along_y, along_z]: [[Step; WIDTH]; 3] = std::array::from_fn(|k| {
+            std::array::from_fn(|i| {
+                let cell = cell[k] - REACH + i as i64;
+                let offset = cell - self.low[k];
+                let d = (cell as f32 + 0.5) * self.size - point[k];
+                let (brick, inner) = (offset / BRICK * strides[k].0, (offset % BRICK) << strides[k].1);
+                Step { brick: brick as usize, inner: inner as usize, square: d * d }
+            })
+        });
+        for x in &along_x {
+            for y in &along_y {
+                let square = x.square + y.square;
+                for z in &along_z {
+                    let first = self.first_cell(x.brick + y.brick + z.brick, distances);
+                    let slot = first + (x.inner | y.inner | z.inner);
+                    if square + z.square < distances[slot] {
+                        distances[slot] = square + z.square;
                         self.cells[slot] = index;
                     }
                 }
@@ -93,20 +128,58 @@ impl NearestGrid {
         }
     }
 
-    fn slot(&mut self, cell: [i64; 3], distances: &mut Vec<f32>) -> usize {
-        let mut brick_index = 0_usize;
-        let mut inner = 0_usize;
-        for k in 0..3 {
-            let offset = cell[k] - self.low[k];
-            brick_index = brick_index * self.bricks[k] as usize + (offset / BRICK) as usize;
-            inner = inner * BRICK as usize + (offset % BRICK) as usize;
-        }
-        if self.table[brick_index] == EMPTY {
-            self.table[brick_index] = (self.cells.len() / BRICK_CELLS) as u32;
+    /// Where the cells of a brick start, which is made if need be.
+    #[inline]
+    fn first_cell(&mut self, brick: usize, distances: &mut Vec<f32>) -> usize {
+        if self.table[brick] == 0 {
+            self.table[brick] = (self.cells.len() / BRICK_CELLS) as u32;
             self.cells.resize(self.cells.len() + BRICK_CELLS, EMPTY);
             distances.resize(self.cells.len(), f32::INFINITY);
         }
-        self.table[brick_index] as usize * BRICK_CELLS + inner
+        self.table[brick] as usize * BRICK_CELLS
+    }
+}
+
+/// What one axis contributes to the place of a cell, and to its squared distance from a point.
+struct Step {
+    brick: usize,
+    inner: usize,
+    square: f32,
+}
+
+/// What it takes to find the cell of a point.
+struct Frame {
+    inverse: f32,
+    low: [f32; 3],
+    /// Cells along each axis.
+    cells: [f32; 3],
+    /// Bricks along each axis.
+    bricks: [u32; 3],
+}
+
+/// The number of a point's brick and of its cell therein, as one number; for a point outside, the brick after the last.
+#[inline]
+fn place(frame: &Frame, x: f32, y: f32, z: f32) -> u32 {
+    let offset = |k: usize, x: f32| (x * frame.inverse).floor() - frame.low[k];
+    let (x, y, z) = (offset(0, x), offset(1, y), offset(2, z));
+    let within = |k: usize, x: f32| (x >= 0.0) && (x < frame.cells[k]);
+    let inside = within(0, x) && within(1, y) && within(2, z);
+    let cell = |x: f32| if inside { x as i32 as u32 } else { 0 };
+    let (x, y, z) = (cell(x), cell(y), cell(z));
+    let [nx, ny, nz] = frame.bricks;
+    let brick = ((x >> BRICK_BITS) * ny + (y >> BRICK_BITS)) * nz + (z >> BRICK_BITS);
+    let low = |x: u32| x & ((1 << BRICK_BITS) - 1);
+    let inner = (low(x) << (2 * BRICK_BITS)) | (low(y) << BRICK_BITS) | low(z);
+    let outside = nx * ny * nz;
+    if inside { (brick << (3 * BRICK_BITS)) | inner } else { outside << (3 * BRICK_BITS) }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn places(frame: &Frame, x: &[f32], y: &[f32], z: &[f32], found: &mut [u32]) {
+    let n = found.len();
+    let (x, y, z) = (&x[..n], &y[..n], &z[..n]);
+    for i in 0..n {
+        found[i] = place(frame, x[i], y[i], z[i]);
     }
 }
 
@@ -162,6 +235,16 @@ mod tests {
         }
         assert_eq!(grid.nearest(&[9.0, 9.0, 9.0]), None);
         assert_eq!(grid.nearest(&[f32::NAN, 0.0, f32::INFINITY]), None);
+
+        let queries: Vec<Point> =
+            (0..300).map(|i| [i as f32 * 0.01, i as f32 * 0.007, (i % 9) as f32 - 4.0]).collect();
+        let axis = |k: usize| -> Vec<f32> { queries.iter().map(|q| q[k]).collect() };
+        let mut found = vec![0; queries.len()];
+        grid.nearest_of_all([&axis(0), &axis(1), &axis(2)], &mut found);
+        for (query, found) in queries.iter().zip(found) {
+            let found = Some(found as usize).filter(|i| *i < points.len());
+            assert_eq!(found, grid.nearest(query));
+        }
     }
 
     #[test]
@@ -169,7 +252,7 @@ mod tests {
         let mut points: Vec<Point> = (0..100).map(|i| [i as f32 * 0.05, 0.0, 0.0]).collect();
         points.push([1e9, -1e9, 1e9]);
         let grid = NearestGrid::new(&points, 0.05);
-        assert!(grid.table.len() <= MAX_BRICKS);
+        assert!(grid.table.len() <= MAX_BRICKS + 1);
         assert_eq!(grid.nearest(&[2.5, 0.0, 0.0]).map(|i| i.abs_diff(50) <= 1), Some(true));
     }
 }

@@ -1,11 +1,12 @@
 //! Dense evidence for a pose of two scans: do their surfaces coincide, and does either put a surface where the other
 //! saw free space?
 
-use nalgebra::Vector3;
+use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
-use crate::features::{Scan, Visibility};
-use crate::geometry::{Point, Pose};
+use super::contacts::{BLOCK, Contacts, Motion};
+use crate::features::Scan;
+use crate::geometry::Pose;
 
 /// A point with a point of the other scan this near, in voxels, lies on its surface if the normals agree …
 const NEAR_VOXELS: f32 = 2.4;
@@ -67,40 +68,26 @@ pub(super) fn share(part: u32, whole: u32) -> f64 {
 /// Looks at every `stride`-th point of `other` against what `scan` holds and saw.
 #[must_use]
 pub fn look(scan: &Scan, other: &Scan, scan_from_other: &Pose, stride: usize) -> Counts {
-    let voxel = scan.prepared.resolution as f32;
-    let near_square = (NEAR_VOXELS * voxel).powi(2);
-    let tight_square = (TIGHT_VOXELS * voxel).powi(2);
-    let rotation = scan_from_other.rotation.matrix().cast::<f32>();
-    let translation = scan_from_other.translation.cast::<f32>();
+    let near = Near::at(scan.prepared.resolution as f32);
+    let motion = Motion::of(scan_from_other);
     let mut counts = Counts::default();
-    for (point, normal) in other.prepared.points.iter().zip(&other.prepared.normals).step_by(stride.max(1)) {
-        counts.points += 1;
-        let q = rotation * Vector3::from(*point) + translation;
-        let moved: Point = [q.x, q.y, q.z];
-        if let Some(near) = scan.grid.nearest(&moved) {
-            let offset = q - Vector3::from(scan.prepared.points[near]);
-            let square = offset.norm_squared();
-            if square < near_square {
-                let surface_normal = Vector3::from(scan.prepared.normals[near]);
-                let agreement = surface_normal.dot(&(rotation * Vector3::from(*normal)));
-                if agreement > NORMAL_DOT {
-                    counts.inliers += 1;
-                    counts.tight += u32::from(square < tight_square);
-                    counts.plane_square += surface_normal.dot(&offset).powi(2);
-                } else if agreement > -NORMAL_DOT {
-                    counts.wrong_normal += 1;
-                }
-                // So near a surface nothing can be clearly in front of it.
-                continue;
+    let (mut block, mut first) = (Contacts::new(), 0);
+    let mut elsewhere = [[0.0; BLOCK]; 3];
+    while let Some(next) = block.fill(scan, other, &motion, first, stride.max(1)) {
+        first = next;
+        counts = counts.plus(&on_surface(&block, &near));
+        let Some(image) = &scan.prepared.range_image else { continue };
+        // So near a surface nothing can be clearly in front of it: only the other points are judged.
+        let mut len = 0;
+        for i in 0..block.len {
+            for k in 0..3 {
+                elsewhere[k][len] = block.point[k][i];
             }
+            len += usize::from(block.square[i] >= near.square);
         }
-        if let Some(image) = &scan.prepared.range_image {
-            match image.judge(&moved) {
-                Visibility::InFront => counts.violations += 1,
-                Visibility::OnSurface => counts.on_seen_surface += 1,
-                Visibility::Hidden | Visibility::Unknown => {}
-            }
-        }
+        let (violations, on_seen_surface) = image.judge_all(elsewhere.each_ref().map(|axis| &axis[..len]));
+        counts.violations += violations;
+        counts.on_seen_surface += on_seen_surface;
     }
     counts
 }
@@ -108,5 +95,56 @@ pub fn look(scan: &Scan, other: &Scan, scan_from_other: &Pose, stride: usize) ->
 /// Number of points of `other`, every `stride`-th looked at, near the surface of `scan`: the quick first look at a pose.
 #[must_use]
 pub fn quick_overlap(scan: &Scan, other: &Scan, scan_from_other: &Pose, stride: usize) -> usize {
-    look(scan, other, scan_from_other, stride).inliers as usize
+    let near = Near::at(scan.prepared.resolution as f32);
+    let motion = Motion::of(scan_from_other);
+    let (mut block, mut first, mut inliers) = (Contacts::new(), 0, 0);
+    while let Some(next) = block.fill(scan, other, &motion, first, stride.max(1)) {
+        first = next;
+        inliers += on_surface(&block, &near).inliers;
+    }
+    inliers as usize
+}
+
+/// Squared distances, square metres.
+struct Near {
+    square: f32,
+    tight: f32,
+}
+
+impl Near {
+    fn at(voxel: f32) -> Self {
+        Self { square: (NEAR_VOXELS * voxel).powi(2), tight: (TIGHT_VOXELS * voxel).powi(2) }
+    }
+}
+
+/// What is counted of a block without free space.
+fn on_surface(block: &Contacts, near: &Near) -> Counts {
+    let mut counts = Counts { points: block.len as u32, ..Counts::default() };
+    count(block, near, &mut counts);
+    counts
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn count(block: &Contacts, near: &Near, counts: &mut Counts) {
+    const LANES: usize = 16;
+    let ([nx, ny, nz], [sx, sy, sz], [dx, dy, dz]) = (&block.normal, &block.surface, &block.offset);
+    let (mut inliers, mut tight, mut wrong) = ([0_u32; LANES], [0_u32; LANES], [0_u32; LANES]);
+    let mut plane = [0.0_f32; LANES];
+    for first in (0..BLOCK).step_by(LANES) {
+        for lane in 0..LANES {
+            let i = first + lane;
+            let agreement = sx[i] * nx[i] + sy[i] * ny[i] + sz[i] * nz[i];
+            let to_plane = sx[i] * dx[i] + sy[i] * dy[i] + sz[i] * dz[i];
+            let close = block.square[i] < near.square;
+            let inlier = close && (agreement > NORMAL_DOT);
+            inliers[lane] += u32::from(inlier);
+            tight[lane] += u32::from(inlier && (block.square[i] < near.tight));
+            wrong[lane] += u32::from(close && !inlier && (agreement > -NORMAL_DOT));
+            plane[lane] += if inlier { to_plane * to_plane } else { 0.0 };
+        }
+    }
+    counts.inliers += inliers.iter().sum::<u32>();
+    counts.tight += tight.iter().sum::<u32>();
+    counts.wrong_normal += wrong.iter().sum::<u32>();
+    counts.plane_square += plane.iter().sum::<f32>();
 }

@@ -1,9 +1,11 @@
 //! Point-to-plane ICP of two scans, with a shrinking gate and a robust weight.
 
+use multiversion::multiversion;
 use nalgebra::{Matrix6, Vector3, Vector6};
 
+use super::contacts::{BLOCK, Contacts, Motion, Numbers};
 use crate::features::Scan;
-use crate::geometry::{Point, Pose};
+use crate::geometry::Pose;
 
 /// Points of the moving scan used, at most: evenly spread over it.
 const MAX_POINTS: usize = 1200;
@@ -11,7 +13,7 @@ const ITERATIONS: usize = 10;
 /// Correspondences farther than the gate are dropped; it shrinks from the first to the last iteration. Voxels.
 const GATE_VOXELS: (f32, f32) = (4.0, 1.6);
 /// Scale of the robust weight (1 + (r / scale)^2)^-2. Voxels.
-const KERNEL_VOXELS: f64 = 0.8;
+const KERNEL_VOXELS: f32 = 0.8;
 /// Normals must agree at least this well (cosine).
 const MIN_NORMAL_DOT: f32 = 0.5;
 /// A step smaller than this, in voxels at the scan's radius, ends the iteration once the gate is small.
@@ -26,9 +28,8 @@ pub fn icp(a: &Scan, b: &Scan, a_from_b: &Pose) -> Pose {
     for iteration in 0..ITERATIONS {
         let share = iteration as f32 / (ITERATIONS - 1) as f32;
         let gate = (GATE_VOXELS.0 + (GATE_VOXELS.1 - GATE_VOXELS.0) * share) * voxel as f32;
-        let Some((hessian, gradient, centre)) =
-            normal_equations(a, b, &pose, stride, gate, KERNEL_VOXELS * voxel)
-        else {
+        let kernel = KERNEL_VOXELS * voxel as f32;
+        let Some((hessian, gradient, centre)) = normal_equations(a, b, &pose, stride, gate, kernel) else {
             break;
         };
         let Some(step) = solve_held(&hessian, &gradient, b.rms_radius) else { break };
@@ -55,44 +56,111 @@ fn normal_equations(
     pose: &Pose,
     stride: usize,
     gate: f32,
-    kernel: f64,
+    kernel: f32,
 ) -> Option<(Matrix6<f64>, Vector6<f64>, Vector3<f64>)> {
-    let rotation = pose.rotation.matrix().cast::<f32>();
-    let translation = pose.translation.cast::<f32>();
-    let mut rows: Vec<(Vector3<f64>, Vector3<f64>, f64)> = Vec::with_capacity(MAX_POINTS);
-    let mut centre = Vector3::zeros();
-    for (point, normal) in b.prepared.points.iter().zip(&b.prepared.normals).step_by(stride) {
-        let q = rotation * Vector3::from(*point) + translation;
-        let moved: Point = [q.x, q.y, q.z];
-        let Some(near) = a.grid.nearest(&moved) else { continue };
-        let target = Vector3::from(a.prepared.points[near]);
-        let offset = q - target;
-        if offset.norm_squared() > gate * gate {
-            continue;
-        }
-        let target_normal = Vector3::from(a.prepared.normals[near]);
-        if target_normal.dot(&(rotation * Vector3::from(*normal))) < MIN_NORMAL_DOT {
-            continue;
-        }
-        let q = q.cast::<f64>();
-        centre += q;
-        rows.push((q, target_normal.cast(), f64::from(target_normal.dot(&offset))));
+    let motion = Motion::of(pose);
+    // Summed about a point that is known beforehand and near enough to the centre for single precision.
+    let about = pose.transform(&b.centroid).cast::<f32>();
+    let limits = Limits { about: about.into(), gate_square: gate * gate, per_kernel: 1.0 / kernel };
+    let mut sums = [0.0_f64; SUMS];
+    let (mut block, mut first) = (Contacts::new(), 0);
+    while let Some(next) = block.fill(a, b, &motion, first, stride) {
+        first = next;
+        accumulate(&block, &limits, &mut sums);
     }
-    if rows.len() < 12 {
+    let [count, x, y, z, rest @ ..] = sums;
+    if count < 12.0 {
         return None;
     }
-    centre /= rows.len() as f64;
-    let mut hessian = Matrix6::zeros();
-    let mut gradient = Vector6::zeros();
-    for (q, normal, residual) in &rows {
-        let weight = (1.0 + (residual / kernel).powi(2)).powi(-2);
-        let turn = (q - centre).cross(normal);
-        let j = Vector6::new(turn.x, turn.y, turn.z, normal.x, normal.y, normal.z);
-        hessian.syger(weight, &j, &j, 1.0);
-        gradient.axpy(weight * residual, &j, 1.0);
+    let (gradient, hessian) = rest.split_at(6);
+    let gradient = Vector6::from_column_slice(gradient);
+    let mut entry = hessian.iter();
+    let mut lower = Matrix6::zeros();
+    for i in 0..6 {
+        for j in 0..=i {
+            lower[(i, j)] = *entry.next()?;
+        }
     }
-    hessian.fill_upper_triangle_with_lower_triangle();
-    Some((hessian, gradient, centre))
+    lower.fill_upper_triangle_with_lower_triangle();
+    // A turn about the centre moves the other point too: (q - c) x n = (q - p) x n - (c - p) x n.
+    let shift = Vector3::new(x, y, z) / count;
+    let mut to_centre = Matrix6::identity();
+    to_centre.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-shift.cross_matrix()));
+    let hessian = to_centre * lower * to_centre.transpose();
+    Some((hessian, to_centre * gradient, about.cast() + shift))
+}
+
+/// What is summed over the correspondences: their number, their positions, the gradient, the lower triangle of the Hessian.
+const SUMS: usize = 1 + 3 + 6 + 21;
+
+struct Limits {
+    about: [f32; 3],
+    gate_square: f32,
+    per_kernel: f32,
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn accumulate(block: &Contacts, limits: &Limits, sums: &mut [f64; SUMS]) {
+    const LANES: usize = 16;
+    let mut parts = [[0.0_f32; LANES]; SUMS];
+    for first in (0..BLOCK).step_by(LANES) {
+        let lanes = |of: &Numbers| -> [f32; LANES] { std::array::from_fn(|lane| of[first + lane]) };
+        let [nx, ny, nz] = block.surface.each_ref().map(lanes);
+        let [mx, my, mz] = block.normal.each_ref().map(lanes);
+        let [dx, dy, dz] = block.offset.each_ref().map(lanes);
+        let [x, y, z] = block.point.each_ref().map(lanes);
+        let square = lanes(&block.square);
+        let mut used = [0.0; LANES];
+        let mut weighted = [0.0; LANES];
+        let mut weight = [0.0; LANES];
+        let mut position = [[0.0; LANES]; 3];
+        let mut jacobian = [[0.0; LANES]; 6];
+        for k in 0..LANES {
+            let agreement = nx[k] * mx[k] + ny[k] * my[k] + nz[k] * mz[k];
+            let residual = nx[k] * dx[k] + ny[k] * dy[k] + nz[k] * dz[k];
+            let meets = (square[k] <= limits.gate_square) && (agreement >= MIN_NORMAL_DOT);
+            let spread = 1.0 + (residual * limits.per_kernel) * (residual * limits.per_kernel);
+            let robust = 1.0 / (spread * spread);
+            used[k] = if meets { 1.0 } else { 0.0 };
+            weight[k] = if meets { robust } else { 0.0 };
+            weighted[k] = if meets { robust * residual } else { 0.0 };
+            let (px, py, pz) = (x[k] - limits.about[0], y[k] - limits.about[1], z[k] - limits.about[2]);
+            // Outside the block's length there may be anything, also what is no number.
+            let (px, py, pz) = if meets { (px, py, pz) } else { (0.0, 0.0, 0.0) };
+            position[0][k] = px;
+            position[1][k] = py;
+            position[2][k] = pz;
+            jacobian[0][k] = py * nz[k] - pz * ny[k];
+            jacobian[1][k] = pz * nx[k] - px * nz[k];
+            jacobian[2][k] = px * ny[k] - py * nx[k];
+            jacobian[3][k] = nx[k];
+            jacobian[4][k] = ny[k];
+            jacobian[5][k] = nz[k];
+        }
+        for k in 0..LANES {
+            parts[0][k] += used[k];
+            parts[1][k] += position[0][k];
+            parts[2][k] += position[1][k];
+            parts[3][k] += position[2][k];
+        }
+        for i in 0..6 {
+            for k in 0..LANES {
+                parts[4 + i][k] += weighted[k] * jacobian[i][k];
+            }
+        }
+        let mut at = 10;
+        for i in 0..6 {
+            for j in 0..=i {
+                for k in 0..LANES {
+                    parts[at][k] += weight[k] * jacobian[i][k] * jacobian[j][k];
+                }
+                at += 1;
+            }
+        }
+    }
+    for (sum, parts) in sums.iter_mut().zip(&parts) {
+        *sum += parts.iter().map(|x| f64::from(*x)).sum::<f64>();
+    }
 }
 
 /// Solves for the step, with directions along which the surfaces slide freely held by a small prior.

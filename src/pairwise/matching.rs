@@ -4,8 +4,13 @@ use multiversion::multiversion;
 
 use crate::features::{DESCRIPTOR_LEN, PreparedScan};
 
-/// Rows of the similarity matrix computed at a time: a block of 128 x 2000 floats stays in the second-level cache.
-const BLOCK: usize = 128;
+/// Rows of the similarity matrix computed at a time: a block of 256 x 2000 floats stays near, and the descriptors of the other scan,
+/// which the product sorts anew for every block, are sorted seldom.
+const BLOCK: usize = 256;
+/// Rows taken together into the columns' bests, so that those pass through the cache once for all of them.
+const TOGETHER: usize = 4;
+/// Less than any similarity that counts.
+const NOTHING: f32 = -1.0;
 
 /// Two keypoints that are each other's nearest in descriptor space.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,29 +33,30 @@ pub fn mutual_matches(a: &PreparedScan, b: &PreparedScan, limit: usize) -> Vec<M
         return Vec::new();
     }
     let mut by_column = Best::new(columns);
-    let mut by_row: Vec<(f32, f32, usize)> = Vec::with_capacity(rows);
+    let mut by_row: Vec<RowBest> = Vec::with_capacity(rows);
     let mut block = vec![0.0_f32; BLOCK * columns];
+    let nothing = vec![NOTHING; columns];
     for first in (0..rows).step_by(BLOCK) {
         let height = BLOCK.min(rows - first);
         similarities(&a.descriptors[first * DESCRIPTOR_LEN..], &b.descriptors, height, columns, &mut block);
-        for row in 0..height {
-            let line = &block[row * columns..(row + 1) * columns];
-            let (best, second) = top_two(line);
-            let at = line.iter().position(|x| *x == best).unwrap_or(0);
-            by_row.push((best, second, at));
-            by_column.update(line, (first + row) as u32);
+        for row in (0..height).step_by(TOGETHER) {
+            let lines: [&[f32]; TOGETHER] = std::array::from_fn(|k| {
+                if row + k < height { &block[(row + k) * columns..(row + k + 1) * columns] } else { &nothing }
+            });
+            by_row.extend(lines.iter().take(height - row).map(|line| RowBest::of(line)));
+            by_column.update(lines, (first + row) as u32);
         }
     }
-    let mut matches: Vec<Match> = by_row
-        .iter()
-        .enumerate()
-        .filter(|(row, (best, _, column))| *best > 0.0 && by_column.index[*column] as usize == *row)
-        .map(|(row, &(best, second, column))| Match {
-            a: row as u16,
-            b: column as u16,
-            ambiguity: ratio(best, second) * ratio(by_column.first[column], by_column.second[column]),
-        })
-        .collect();
+    let mut matches: Vec<Match> = Vec::with_capacity(rows.min(columns));
+    for column in 0..columns {
+        let (first, row) = (by_column.first[column], by_column.index[column] as usize);
+        let RowBest { best, second, tied } = by_row[row];
+        // The greatest of its column is the greatest of its row too, and if there are several, the first of them.
+        if first > 0.0 && first == best && tied.is_none_or(|first_column| first_column == column) {
+            let ambiguity = ratio(best, second) * ratio(first, by_column.second[column]);
+            matches.push(Match { a: row as u16, b: column as u16, ambiguity });
+        }
+    }
     matches.sort_by(|x, y| x.ambiguity.total_cmp(&y.ambiguity).then(x.a.cmp(&y.a)));
     matches.truncate(limit);
     matches
@@ -88,6 +94,22 @@ fn similarities(a: &[f32], b: &[f32], height: usize, columns: usize, block: &mut
     }
 }
 
+/// The two largest values of a row.
+struct RowBest {
+    best: f32,
+    second: f32,
+    /// Where several are the largest, the first of them. A single one is found from its column, without a search.
+    tied: Option<usize>,
+}
+
+impl RowBest {
+    fn of(line: &[f32]) -> Self {
+        let (best, second) = top_two(line);
+        let tied = if best == second { line.iter().position(|x| *x == best) } else { None };
+        Self { best, second, tied }
+    }
+}
+
 /// The two largest values of each column seen so far, and where the largest is.
 struct Best {
     first: Vec<f32>,
@@ -97,29 +119,43 @@ struct Best {
 
 impl Best {
     fn new(columns: usize) -> Self {
-        Self { first: vec![-1.0; columns], second: vec![-1.0; columns], index: vec![0; columns] }
+        Self { first: vec![NOTHING; columns], second: vec![NOTHING; columns], index: vec![0; columns] }
     }
 
-    fn update(&mut self, line: &[f32], row: u32) {
-        update_columns(line, row, &mut self.first, &mut self.second, &mut self.index);
+    /// Takes rows in, of which the first has number `row`.
+    fn update(&mut self, lines: [&[f32]; TOGETHER], row: u32) {
+        update_columns(lines, row, &mut self.first, &mut self.second, &mut self.index);
     }
 }
 
 #[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
-fn update_columns(line: &[f32], row: u32, best: &mut [f32], second: &mut [f32], index: &mut [u32]) {
-    for (((x, best), second), index) in line.iter().zip(best).zip(second).zip(index) {
-        let lower = if *x < *best { *x } else { *best };
-        *second = if lower > *second { lower } else { *second };
-        *index = if *x > *best { row } else { *index };
-        *best = if *x > *best { *x } else { *best };
+fn update_columns(
+    [w, x, y, z]: [&[f32]; TOGETHER],
+    row: u32,
+    best: &mut [f32],
+    second: &mut [f32],
+    index: &mut [u32],
+) {
+    let n = best.len();
+    let (w, x, y, z) = (&w[..n], &x[..n], &y[..n], &z[..n]);
+    let (second, index) = (&mut second[..n], &mut index[..n]);
+    for i in 0..n {
+        let (mut top, mut next, mut at) = (best[i], second[i], index[i]);
+        for (value, row) in [(w[i], row), (x[i], row + 1), (y[i], row + 2), (z[i], row + 3)] {
+            let lower = if value < top { value } else { top };
+            next = if lower > next { lower } else { next };
+            at = if value > top { row } else { at };
+            top = if value > top { value } else { top };
+        }
+        (best[i], second[i], index[i]) = (top, next, at);
     }
 }
 
 #[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
 fn top_two(line: &[f32]) -> (f32, f32) {
     const LANES: usize = 16;
-    let mut best = [-1.0_f32; LANES];
-    let mut second = [-1.0_f32; LANES];
+    let mut best = [NOTHING; LANES];
+    let mut second = [NOTHING; LANES];
     let mut chunks = line.chunks_exact(LANES);
     for chunk in &mut chunks {
         for k in 0..LANES {
@@ -129,7 +165,7 @@ fn top_two(line: &[f32]) -> (f32, f32) {
             best[k] = if x > best[k] { x } else { best[k] };
         }
     }
-    let mut top = (-1.0, -1.0);
+    let mut top = (NOTHING, NOTHING);
     for &x in best.iter().chain(&second).chain(chunks.remainder()) {
         if x > top.0 {
             top = (x, top.0);
@@ -156,8 +192,9 @@ mod tests {
         #[test]
         fn columns_keep_their_two_largest(a in prop::collection::vec(0.0..1.0f32, 2..50)) {
             let mut best = Best::new(1);
-            for (row, x) in a.iter().enumerate() {
-                best.update(&[*x], row as u32);
+            for (row, x) in a.chunks(TOGETHER).enumerate() {
+                let lines = std::array::from_fn(|k| x.get(k).map_or(&[NOTHING][..], std::slice::from_ref));
+                best.update(lines, (row * TOGETHER) as u32);
             }
             let mut sorted = a.clone();
             sorted.sort_by(|x, y| y.total_cmp(x));

@@ -3,6 +3,7 @@
 
 pub mod calibration;
 mod consensus;
+mod contacts;
 mod dense;
 mod icp;
 mod matching;

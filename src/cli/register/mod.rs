@@ -9,7 +9,7 @@ mod output;
 mod pipeline;
 mod poses;
 mod report;
-mod source;
+pub(super) mod source;
 
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -13,7 +13,7 @@ use crate::project::Interpretation;
 
 /// Why a scan takes no part, in the words of the service.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(super) struct Failure {
+pub(in crate::cli) struct Failure {
     /// `unreadable-scan` or `unfit-scan`.
     pub reason: &'static str,
     /// What is wrong with it.
@@ -22,7 +22,7 @@ pub(super) struct Failure {
 
 /// A failure, or the wish to stop.
 #[derive(Debug)]
-pub(super) enum Refusal {
+pub(in crate::cli) enum Refusal {
     Failed(Failure),
     Cancelled(Cancelled),
 }
@@ -66,7 +66,7 @@ impl From<PrepareError> for Refusal {
 }
 
 /// A decoded file.
-pub(super) struct Source {
+pub(in crate::cli) struct Source {
     /// What the engine knows it by: the same as the service's for the same bytes read the same way.
     pub key: ScanKey,
     /// Its points.

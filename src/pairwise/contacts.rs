@@ -1,0 +1,141 @@
+//! Points of one scan carried into another, and what they meet there: what dense evidence and alignment are both made of.
+//!
+//! Points go through in blocks, one array a coordinate, so that the arithmetic runs on many at once and the lookups between, which wait
+//! for memory, do not wait for each other.
+
+use multiversion::multiversion;
+
+use crate::features::Scan;
+use crate::geometry::{Point, Pose};
+
+/// Points of a block. Its arrays stay in the first-level cache.
+pub(super) const BLOCK: usize = 256;
+
+/// One number a point of the block.
+pub(super) type Numbers = [f32; BLOCK];
+
+/// A motion in single precision: rotation by rows, and translation in metres.
+pub(super) struct Motion {
+    rotation: [[f32; 3]; 3],
+    translation: [f32; 3],
+}
+
+impl Motion {
+    /// Of a pose.
+    pub fn of(pose: &Pose) -> Self {
+        let rotation = pose.rotation.matrix();
+        Self {
+            rotation: std::array::from_fn(|i| std::array::from_fn(|j| rotation[(i, j)] as f32)),
+            translation: std::array::from_fn(|k| pose.translation[k] as f32),
+        }
+    }
+}
+
+/// A block of points of one scan, carried into the frame of another. Beyond `len` the arrays hold nothing of meaning, except that
+/// `square` is infinite there.
+pub(super) struct Contacts {
+    /// Points of the block in use.
+    pub len: usize,
+    /// The carried points, metres.
+    pub point: [Numbers; 3],
+    /// Their turned normals.
+    pub normal: [Numbers; 3],
+    /// Normals of the points that they meet.
+    pub surface: [Numbers; 3],
+    /// From the points that they meet to them, metres.
+    pub offset: [Numbers; 3],
+    /// Square of its length; infinite where nothing is near.
+    pub square: Numbers,
+    found: [u32; BLOCK],
+}
+
+impl Contacts {
+    /// An empty block.
+    pub fn new() -> Self {
+        const NONE: [Numbers; 3] = [[0.0; BLOCK]; 3];
+        Self {
+            len: 0,
+            point: NONE,
+            normal: NONE,
+            surface: NONE,
+            offset: NONE,
+            square: [f32::INFINITY; BLOCK],
+            found: [0; BLOCK],
+        }
+    }
+
+    /// Fills the block with the next points of `other`, every `stride`-th from `first`, at most [`BLOCK`], and gives the first
+    /// that has to follow; `None` when there are no more.
+    pub fn fill(
+        &mut self,
+        scan: &Scan,
+        other: &Scan,
+        motion: &Motion,
+        first: usize,
+        stride: usize,
+    ) -> Option<usize> {
+        let (from, onto) = (&other.prepared, &scan.prepared);
+        let last = onto.points.len().checked_sub(1)?;
+        let points = from.points.get(first..)?.iter().step_by(stride);
+        let normals = from.normals.get(first..)?.iter().step_by(stride);
+        self.len = 0;
+        for (i, (point, normal)) in points.zip(normals).take(BLOCK).enumerate() {
+            for k in 0..3 {
+                self.point[k][i] = point[k];
+                self.normal[k][i] = normal[k];
+            }
+            self.len = i + 1;
+        }
+        if self.len == 0 {
+            return None;
+        }
+        carry(&mut self.point, &mut self.normal, motion);
+        let used = self.len;
+        let [x, y, z] = &self.point;
+        scan.grid.nearest_of_all([&x[..used], &y[..used], &z[..used]], &mut self.found[..used]);
+        for (i, found) in self.found[..used].iter_mut().enumerate() {
+            let near = (*found as usize).min(last);
+            let (target, normal): (&Point, &Point) = (&onto.points[near], &onto.normals[near]);
+            for k in 0..3 {
+                self.offset[k][i] = target[k];
+                self.surface[k][i] = normal[k];
+            }
+        }
+        self.found[used..].fill(u32::MAX);
+        part(&self.point, &mut self.offset, &mut self.square, &self.found, last as u32);
+        Some(first + BLOCK * stride)
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn carry([x, y, z]: &mut [Numbers; 3], [nx, ny, nz]: &mut [Numbers; 3], motion: &Motion) {
+    let Motion { rotation: r, translation: t } = motion;
+    for i in 0..BLOCK {
+        let (px, py, pz) = (x[i], y[i], z[i]);
+        x[i] = r[0][0] * px + r[0][1] * py + r[0][2] * pz + t[0];
+        y[i] = r[1][0] * px + r[1][1] * py + r[1][2] * pz + t[1];
+        z[i] = r[2][0] * px + r[2][1] * py + r[2][2] * pz + t[2];
+        let (px, py, pz) = (nx[i], ny[i], nz[i]);
+        nx[i] = r[0][0] * px + r[0][1] * py + r[0][2] * pz;
+        ny[i] = r[1][0] * px + r[1][1] * py + r[1][2] * pz;
+        nz[i] = r[2][0] * px + r[2][1] * py + r[2][2] * pz;
+    }
+}
+
+/// Turns targets into offsets, with their squares.
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn part(
+    [x, y, z]: &[Numbers; 3],
+    [dx, dy, dz]: &mut [Numbers; 3],
+    square: &mut Numbers,
+    found: &[u32; BLOCK],
+    last: u32,
+) {
+    for i in 0..BLOCK {
+        dx[i] = x[i] - dx[i];
+        dy[i] = y[i] - dy[i];
+        dz[i] = z[i] - dz[i];
+        let apart = dx[i] * dx[i] + dy[i] * dy[i] + dz[i] * dz[i];
+        square[i] = if found[i] <= last { apart } else { f32::INFINITY };
+    }
+}
