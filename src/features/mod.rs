@@ -2,6 +2,8 @@
 //! (voxel index, range image) that verification reads. Uses `cloud` and `geometry`; used by `pairwise` and above.
 
 mod fpfh;
+mod keypoints;
+mod planes;
 mod prepared;
 mod range_image;
 mod resolution;
@@ -9,6 +11,8 @@ mod sensor;
 mod signature;
 
 pub use fpfh::{DESCRIPTOR_LEN, Descriptor, fpfh};
+pub use keypoints::select_keypoints;
+pub use planes::{Offsets, PlaneProfile};
 pub use prepared::{PrepareError, PrepareOptions, PreparedScan, Scan, prepare};
 pub use range_image::{RangeImage, Visibility};
 pub use resolution::{choose_resolution, extent, natural_resolution};

@@ -2,10 +2,11 @@
 //! stored; [`Scan`] adds the lookup grid, to be computed with.
 
 use nalgebra::Vector3;
-use rand::seq::index::sample;
 use serde::{Deserialize, Serialize};
 
 use super::fpfh::{DESCRIPTOR_LEN, fpfh};
+use super::keypoints::select_keypoints;
+use super::planes::PlaneProfile;
 use super::range_image::RangeImage;
 use super::resolution::extent;
 use super::sensor::{SensorPosition, viewpoint};
@@ -134,6 +135,8 @@ pub struct Scan {
     pub centroid: Vector3<f64>,
     /// Root mean square distance of the points from their mean, metres.
     pub rms_radius: f64,
+    /// Its planes, where its normals concentrate in three orthogonal directions.
+    pub planes: Option<PlaneProfile>,
 }
 
 impl Scan {
@@ -145,7 +148,8 @@ impl Scan {
         let position = |p: &Point| Vector3::from(*p).cast::<f64>();
         let centroid = prepared.points.iter().map(position).sum::<Vector3<f64>>() / n;
         let square = prepared.points.iter().map(|p| (position(p) - centroid).norm_squared()).sum::<f64>() / n;
-        Self { prepared, grid, centroid, rms_radius: square.sqrt() }
+        let planes = PlaneProfile::of(&prepared.points, &prepared.normals, prepared.resolution as f32);
+        Self { prepared, grid, centroid, rms_radius: square.sqrt(), planes }
     }
 
     /// Which scan.
@@ -198,11 +202,7 @@ pub fn prepare(
     let all = fpfh(&points, &normals, DESCRIPTOR_RADIUS * v);
     control.check()?;
     let mut rng = options.seed.derive("keypoints", key.0);
-    let mut keypoints: Vec<u32> = sample(&mut rng, points.len(), options.keypoints.min(points.len()))
-        .into_iter()
-        .map(|index| index as u32)
-        .collect();
-    keypoints.sort_unstable();
+    let keypoints = select_keypoints(&mut rng, &all, options.keypoints);
     let mut descriptors = Vec::with_capacity(keypoints.len() * DESCRIPTOR_LEN);
     for &keypoint in &keypoints {
         descriptors.extend_from_slice(&all[keypoint as usize]);

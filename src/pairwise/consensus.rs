@@ -103,6 +103,14 @@ pub fn consensus(a: &Scan, b: &Scan, matches: &[Match], options: &ConsensusOptio
     kept
 }
 
+/// The matches that agree with a motion, however it was found.
+#[must_use]
+pub fn agreement(a: &Scan, b: &Scan, matches: &[Match], a_from_b: &Pose) -> Consensus {
+    let tolerance = INLIER_VOXELS * a.prepared.resolution;
+    let pairs = matches.iter().map(|m| (b.keypoint(m.b as usize), a.keypoint(m.a as usize)));
+    judge(pairs, *a_from_b, tolerance * tolerance)
+}
+
 /// The angle between two motions (rad) and how far apart they put `centre` (metres).
 #[must_use]
 pub fn centred_difference(x: &Pose, y: &Pose, centre: &Vector3<f64>) -> (f64, f64) {
@@ -112,14 +120,14 @@ pub fn centred_difference(x: &Pose, y: &Pose, centre: &Vector3<f64>) -> (f64, f6
 /// Two rounds of least squares on the matches within the tolerance.
 fn refit(pairs: &[(Vector3<f64>, Vector3<f64>)], first: Pose, tolerance: f64) -> Consensus {
     let square = tolerance * tolerance;
-    let mut best = judge(pairs, first, square);
+    let mut best = judge(pairs.iter().copied(), first, square);
     for _ in 0..2 {
         let near = pairs.iter().filter_map(|(in_b, in_a)| {
             let r2 = (best.a_from_b.transform(in_b) - in_a).norm_squared();
             (r2 < square).then(|| (*in_b, *in_a, 1.0 / (1.0 + r2 / square)))
         });
         let Some(pose) = rigid_fit(near) else { break };
-        let next = judge(pairs, pose, square);
+        let next = judge(pairs.iter().copied(), pose, square);
         if next.score <= best.score {
             break;
         }
@@ -128,10 +136,14 @@ fn refit(pairs: &[(Vector3<f64>, Vector3<f64>)], first: Pose, tolerance: f64) ->
     best
 }
 
-fn judge(pairs: &[(Vector3<f64>, Vector3<f64>)], a_from_b: Pose, square: f64) -> Consensus {
+fn judge(
+    pairs: impl Iterator<Item = (Vector3<f64>, Vector3<f64>)>,
+    a_from_b: Pose,
+    square: f64,
+) -> Consensus {
     let (mut score, mut inliers) = (0.0, 0);
     for (in_b, in_a) in pairs {
-        let r2 = (a_from_b.transform(in_b) - in_a).norm_squared();
+        let r2 = (a_from_b.transform(&in_b) - in_a).norm_squared();
         if r2 < square {
             score += 1.0 - r2 / square;
             inliers += 1;

@@ -8,13 +8,17 @@ mod dense;
 mod icp;
 mod matching;
 mod pair;
+mod planar;
+mod shortlist;
 mod verifier;
 
-pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, centred_difference, consensus};
+pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, agreement, centred_difference, consensus};
 pub use dense::{Counts, look, quick_overlap};
 pub use icp::{icp, perturbed_about};
 pub use matching::{Match, mutual_matches};
 pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};
+pub use planar::planar_poses;
+pub use shortlist::shortlist;
 pub use verifier::{
     Evidence, FEATURES, Logistic, TRIPLET_FEATURES, Verifier, VerifierError, shipped_verifier,
 };

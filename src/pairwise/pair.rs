@@ -2,10 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, centred_difference, consensus};
-use super::dense::{look, quick_overlap};
+use super::consensus::{INLIER_VOXELS, agreement, centred_difference};
+use super::dense::look;
 use super::icp::icp;
 use super::matching::mutual_matches;
+use super::shortlist::shortlist;
 use super::verifier::{Evidence, Verifier};
 use crate::cloud::ScanKey;
 use crate::features::Scan;
@@ -13,9 +14,11 @@ use crate::geometry::Pose;
 
 /// Matches of a pair, at most.
 const MAX_MATCHES: usize = 800;
-/// Hypotheses that are refined and verified, the best by a quick dense look.
+/// Poses that are refined and verified, the most promising at a glance.
 const REFINED: usize = 6;
-const QUICK_STRIDE: usize = 4;
+/// Refined poses closer than this (rad, voxels) are one hypothesis.
+const SAME_ANGLE: f64 = 0.085;
+const SAME_VOXELS: f64 = 2.5;
 
 /// An unordered pair of scans: `a < b`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -62,29 +65,22 @@ pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
     let (a, b) = if x.key() < y.key() { (x, y) } else { (y, x) };
     let pair = PairKey { a: a.key(), b: b.key() };
     let matches = mutual_matches(&a.prepared, &b.prepared, MAX_MATCHES);
-    let options = ConsensusOptions::default();
-    let mut ranked: Vec<(usize, Consensus)> = consensus(a, b, &matches, &options)
-        .into_iter()
-        .map(|candidate| (quick_overlap(a, b, &candidate.a_from_b, QUICK_STRIDE), candidate))
-        .collect();
-    ranked.sort_by(|x, y| y.0.cmp(&x.0).then(y.1.score.total_cmp(&x.1.score)));
-    ranked.truncate(REFINED);
-    let matches: Vec<(u16, u16)> = matches.iter().map(|m| (m.a, m.b)).collect();
-    let mut hypotheses: Vec<Hypothesis> = Vec::with_capacity(ranked.len());
-    for (_, candidate) in ranked {
+    let mut hypotheses: Vec<Hypothesis> = Vec::with_capacity(REFINED);
+    for candidate in shortlist(a, b, &matches, REFINED) {
         let a_from_b = icp(a, b, &candidate.a_from_b);
         let known = hypotheses.iter().any(|h| {
             let (angle, distance) = centred_difference(&h.a_from_b, &a_from_b, &b.centroid);
-            angle < 0.5 * options.same_angle && distance < 0.5 * options.same_voxels * a.prepared.resolution
+            angle < SAME_ANGLE && distance < SAME_VOXELS * a.prepared.resolution
         });
         if known {
             continue;
         }
+        let agreeing = agreement(a, b, &matches, &a_from_b);
         let evidence = Evidence {
             b_on_a: look(a, b, &a_from_b, 1),
             a_on_b: look(b, a, &a_from_b.inverse(), 1),
-            consensus: candidate.score as f32,
-            match_inliers: inlier_matches(a, b, &matches, &a_from_b).count() as u32,
+            consensus: agreeing.score.max(candidate.score) as f32,
+            match_inliers: agreeing.inliers as u32,
             matches: matches.len() as u32,
             range_images: [a, b].iter().filter(|scan| scan.prepared.range_image.is_some()).count() as u32,
         };
@@ -92,7 +88,7 @@ pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
         hypotheses.push(Hypothesis { a_from_b, evidence, logit });
     }
     hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));
-    PairResult { pair, matches, hypotheses }
+    PairResult { pair, matches: matches.iter().map(|m| (m.a, m.b)).collect(), hypotheses }
 }
 
 /// The matches that agree with a pose, in the order given.

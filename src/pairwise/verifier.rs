@@ -21,7 +21,7 @@ pub struct Evidence {
     pub b_on_a: Counts,
     /// Points of a against b.
     pub a_on_b: Counts,
-    /// Soft count of agreeing matches when the hypothesis was found.
+    /// Soft count of agreeing matches: when the hypothesis was found or after it was refined, whichever is more.
     pub consensus: f32,
     /// Matches that agree with the refined pose.
     pub match_inliers: u32,
