@@ -75,12 +75,12 @@ mod tests {
     fn a_plane_has_its_own_normal_and_a_line_has_none() {
         let plane: Vec<Point> =
             (0..100).map(|i| [(i % 10) as f32 * 0.02, (i / 10) as f32 * 0.02, 1.0]).collect();
-        let index = NeighborIndex::new(&plane);
+        let index = NeighborIndex::new(&plane, 0.06);
         let found = normals(&plane[55..56], &plane, &index, 0.06)[0].expect("a plane");
         assert!(found[2].abs() > 0.9999);
         assert!(face(found, &plane[55], &[0.0, 0.0, 0.0])[2] < 0.0);
 
         let line: Vec<Point> = (0..100).map(|i| [i as f32 * 0.01, 0.0, 1.0]).collect();
-        assert_eq!(normals(&line[50..51], &line, &NeighborIndex::new(&line), 0.06), vec![None]);
+        assert_eq!(normals(&line[50..51], &line, &NeighborIndex::new(&line, 0.06), 0.06), vec![None]);
     }
 }

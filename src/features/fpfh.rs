@@ -18,7 +18,7 @@ pub type Descriptor = [f32; DESCRIPTOR_LEN];
 /// one a point. A point without neighbours gets the zero descriptor, which matches nothing.
 #[must_use]
 pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor> {
-    let index = NeighborIndex::new(points);
+    let index = NeighborIndex::new(points, radius);
     let neighborhoods: Vec<Vec<(u32, f32)>> = points
         .par_iter()
         .enumerate()

@@ -185,7 +185,8 @@ pub fn prepare(
     if coarse.len() > MAX_POINTS {
         return Err(PrepareError::TooManyPoints { found: coarse.len(), limit: MAX_POINTS, resolution });
     }
-    let raw_normals = normals(&coarse, &fine, &NeighborIndex::new(&fine), NORMAL_RADIUS * v);
+    let reach = NORMAL_RADIUS * v;
+    let raw_normals = normals(&coarse, &fine, &NeighborIndex::new(&fine, reach), reach);
     control.check()?;
 
     let frame_origin = cloud.origin.map(|x| -x as f32);

@@ -40,7 +40,8 @@ pub fn occupied_voxels(points: &[Point], size: f32) -> usize {
     sorted_by_cell(points, size).chunk_by(|a, b| a.0 == b.0).count()
 }
 
-fn sorted_by_cell(points: &[Point], size: f32) -> Vec<([i64; 3], u32)> {
+/// The points (by number) with their cells, sorted by both.
+pub(super) fn sorted_by_cell(points: &[Point], size: f32) -> Vec<([i64; 3], u32)> {
     let mut order: Vec<_> =
         points.iter().enumerate().map(|(index, point)| (cell_of(point, size), index as u32)).collect();
     order.sort_unstable();

@@ -39,7 +39,7 @@ impl<'s> Features<'s> {
         Self {
             scan,
             descriptors: fpfh(points, &scan.prepared.normals, radius),
-            index: NeighborIndex::new(points),
+            index: NeighborIndex::new(points, PATCH_VOXELS * scan.prepared.resolution as f32),
         }
     }
 

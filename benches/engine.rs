@@ -1,0 +1,214 @@
+//! The engine's kernels on simulated scans: `cargo bench --bench engine`, or with a name behind it for one of them.
+//!
+//! Each says what bounds it, found with a sampling profiler and by exchanging parts, on a server processor with AVX-512; with narrower
+//! vectors arithmetic weighs more. All run on one thread, on panoramic scans of 20,000 points.
+
+use std::collections::BTreeSet;
+use std::hint::black_box;
+use std::sync::{Arc, LazyLock};
+use std::time::Duration;
+
+use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
+
+use cairn::cloud::{PointCloud, ScanKey, normals};
+use cairn::control::{CancelToken, Control, Seed, Silent};
+use cairn::features::{
+    Descriptor, PrepareOptions, Scan, SensorPosition, choose_resolution, fpfh, natural_resolution, prepare,
+    signature,
+};
+use cairn::geometry::{NearestGrid, NeighborIndex, Point, Pose, voxel_centroids};
+use cairn::graph::{ScanGraph, SupportOptions};
+use cairn::pairwise::{
+    ConsensusOptions, Match, PairKey, PairResult, consensus, icp, look, match_pair, mutual_matches,
+    shipped_verifier,
+};
+use cairn::simulate::{BuildingOptions, Sensor, SurveyOptions, simulate};
+
+/// What all kernels are given: scans of a small office, two of them that overlap well, and the truth about those.
+struct Fixture {
+    clouds: Vec<PointCloud>,
+    options: PrepareOptions,
+    scans: Vec<Arc<Scan>>,
+    a_from_b: Pose,
+    matches: Vec<Match>,
+}
+
+static FIXTURE: LazyLock<Fixture> = LazyLock::new(|| {
+    // One thread, so that figures are CPU time.
+    rayon::ThreadPoolBuilder::new().num_threads(1).build_global().expect("no pool yet");
+    let survey = simulate(&SurveyOptions {
+        building: BuildingOptions { rooms: 3, ..BuildingOptions::default() },
+        sensor: Sensor::panoramic(20_000),
+        stations: 8,
+        least_overlap: 0.5,
+        seed: Seed(1),
+        ..SurveyOptions::default()
+    })
+    .expect("a valid survey");
+    let clouds: Vec<PointCloud> = survey.scans.iter().map(|scan| scan.cloud.clone()).collect();
+    let natural: Vec<f64> = clouds.iter().map(|cloud| natural_resolution(&cloud.points)).collect();
+    let options = PrepareOptions::at(choose_resolution(&natural), Seed(1));
+    let scans: Vec<Arc<Scan>> =
+        clouds.iter().zip(0..).map(|(cloud, key)| Arc::new(ready(cloud, ScanKey(key), &options))).collect();
+    let overlaps = survey.overlaps(2.0 * options.resolution as f32);
+    let second = (1..scans.len()).max_by(|i, j| overlaps[0][*i].total_cmp(&overlaps[0][*j])).expect("scans");
+    // The pair comes first.
+    let (mut clouds, mut scans) = (clouds, scans);
+    clouds.swap(1, second);
+    scans.swap(1, second);
+    let in_local = |scan: usize, at: usize| {
+        survey.scans[at].model_from_scan * scans[scan].prepared.local_from_scan().inverse()
+    };
+    let a_from_b = in_local(0, 0).inverse() * in_local(1, second);
+    let matches = mutual_matches(&scans[0].prepared, &scans[1].prepared, 800);
+    Fixture { clouds, options, scans, a_from_b, matches }
+});
+
+fn ready(cloud: &PointCloud, key: ScanKey, options: &PrepareOptions) -> Scan {
+    let cancel = CancelToken::new();
+    let control = Control { cancel: &cancel, observer: &Silent };
+    Scan::new(
+        prepare(key, cloud, SensorPosition::Assumed, options, control).expect("a scan that can be prepared"),
+    )
+}
+
+/// The whole of ingest after decoding: the parts below, and the range image.
+fn preparing(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    c.bench_function("prepare", |b| b.iter(|| ready(black_box(&f.clouds[0]), ScanKey(0), &f.options)));
+}
+
+/// Bound by branch misses: two thirds of the time is the sort by cell, whose comparisons of unordered points nobody can predict, one third
+/// turning points into cells and summing them. Bytes do not matter; the 20,000 points are in the second-level cache.
+fn voxel_grid(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let size = f.options.resolution as f32 / 2.0;
+    c.bench_function("voxel_centroids", |b| b.iter(|| voxel_centroids(black_box(&f.clouds[0].points), size)));
+}
+
+/// Bound by arithmetic: the distances of about three times as many points as lie in the radius, computed many at once; sums of products
+/// in double precision over those that do; and the eigenvectors of one 3 x 3 matrix after the other, whose steps wait for
+/// each other. With a kd-tree, which branches for every few points, lookups were two fifths of preparing a scan.
+fn surface_normals(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let voxel = f.options.resolution as f32;
+    let fine = voxel_centroids(&f.clouds[0].points, voxel / 2.0);
+    let coarse = voxel_centroids(&fine, voxel);
+    let index = NeighborIndex::new(&fine, 2.0 * voxel);
+    c.bench_function("normals", |b| b.iter(|| normals(black_box(&coarse), &fine, &index, 2.0 * voxel)));
+}
+
+/// Bound by arithmetic: about 100 neighbours a point, each found by its distance, each with three angles, and each adding a histogram of 33
+/// numbers, which comes from the second-level cache. With one arctangent at a time through libm the angles alone took twice as
+/// long as all of this.
+fn descriptors(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let scan = &f.scans[0].prepared;
+    let radius = 5.0 * f.options.resolution as f32;
+    c.bench_function("fpfh", |b| b.iter(|| fpfh(black_box(&scan.points), &scan.normals, radius)));
+}
+
+/// Bound by the throughput of multiply-add: 512 waves times all points times 33 numbers, and a cosine for each product, as a polynomial.
+/// Calling libm's cosine made it ten times as long.
+fn signatures(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let scan = &f.scans[0].prepared;
+    let all: Vec<Descriptor> = fpfh(&scan.points, &scan.normals, 5.0 * f.options.resolution as f32);
+    c.bench_function("signature", |b| b.iter(|| signature(black_box(&all))));
+}
+
+/// Bound by branch misses and stores: each point is offered to 343 cells, in runs of seven, and is taken by those that have no nearer one.
+/// The cells and their distances are in the second-level cache as the points come sorted.
+fn nearest_grid(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let points: &[Point] = &f.scans[0].prepared.points;
+    let size = f.options.resolution as f32;
+    c.bench_function("nearest_grid", |b| b.iter(|| NearestGrid::new(black_box(points), size)));
+}
+
+/// Bound by the throughput of fused multiply-add: 2,000 x 2,000 x 33 of them are 60 % of the time, at most of what the core can do. 25 %
+/// is reading the product back for the two best of each row and column, from the second-level cache, and 10 % sorting the
+/// descriptors for the product.
+fn matching(c: &mut Criterion) {
+    let [x, y] = [0, 1].map(|k: usize| &FIXTURE.scans[k].prepared);
+    c.bench_function("mutual_matches", |b| b.iter(|| mutual_matches(black_box(x), black_box(y), 800)));
+}
+
+/// Bound by arithmetic in the first-level cache, in three parts of like size: which of all pairs of matches are compatible, and how many
+/// third matches agree with both, on bit sets (AND and population count); closed-form fits from 60 seeds; and judging all
+/// matches against each fit.
+fn second_order_consensus(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let options = ConsensusOptions::default();
+    c.bench_function("consensus", |b| {
+        b.iter(|| consensus(&f.scans[0], &f.scans[1], black_box(&f.matches), &options));
+    });
+}
+
+/// Bound by the latency of the second-level cache: a point of the other scan costs two loads that follow each other (brick, cell), then one of a
+/// point and one of a normal, in places that the pose decides. They wait for each other across points as little as the
+/// core allows, since nothing between them branches; with the branches it took more than twice as long. In a wrong pose points
+/// also go to the range image, another load each.
+fn verification(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let wrong = Pose::from_translation(nalgebra::Vector3::new(0.7, -0.4, 0.2)) * f.a_from_b;
+    for (name, pose) in [("look, right pose", f.a_from_b), ("look, wrong pose", wrong)] {
+        c.bench_function(name, |b| b.iter(|| look(&f.scans[0], &f.scans[1], black_box(&pose), 1)));
+    }
+}
+
+/// Bound half by the same loads as a look, ten times for 1,200 points, and half by the throughput of arithmetic: 27 sums a point of
+/// the normal equations, more than the registers hold.
+fn alignment(c: &mut Criterion) {
+    let f = &*FIXTURE;
+    let shift = 2.0 * f.options.resolution;
+    let start = Pose::from_translation(nalgebra::Vector3::new(shift, -shift, 0.5 * shift)) * f.a_from_b;
+    c.bench_function("icp", |b| b.iter(|| icp(&f.scans[0], &f.scans[1], black_box(&start))));
+}
+
+/// A pair from descriptors to verified hypotheses: matching, consensus, a quick look at twelve poses, ICP and two looks at six.
+fn whole_pair(c: &mut Criterion) {
+    let [x, y] = [0, 1].map(|k: usize| &FIXTURE.scans[k]);
+    let verifier = shipped_verifier();
+    c.bench_function("match_pair", |b| b.iter(|| match_pair(black_box(x), y, &verifier)));
+}
+
+/// Bound by products of 3 x 3 matrices: six hypotheses of each side of each triangle, 36 paths, each compared with six poses; most
+/// comparisons end at the distance, before the angle. It is nothing beside the pairs themselves until scans are hundreds.
+fn triplet_support(c: &mut Criterion) {
+    let scans = &FIXTURE.scans;
+    let options = SupportOptions::default();
+    let mut bare = ScanGraph::new();
+    for scan in scans {
+        bare.add_scan(scan.clone());
+    }
+    let pairs: BTreeSet<PairKey> = scans
+        .iter()
+        .flat_map(|x| scans.iter().map(|y| PairKey::of(x.key(), y.key())))
+        .filter(|pair| pair.a != pair.b)
+        .collect();
+    let cancel = CancelToken::new();
+    let control = Control { cancel: &cancel, observer: &Silent };
+    let results: Vec<PairResult> = bare.clone().try_pairs(&pairs, &options, control).expect("nobody cancels");
+    c.bench_function("triplet support of 28 pairs", |b| {
+        b.iter_batched(
+            || (bare.clone(), results.clone()),
+            |(mut graph, results)| {
+                graph.add_results(results, &options);
+                graph
+            },
+            BatchSize::SmallInput,
+        );
+    });
+}
+
+criterion_group! {
+    name = engine;
+    config = Criterion::default()
+        .sample_size(20)
+        .warm_up_time(Duration::from_millis(300))
+        .measurement_time(Duration::from_secs(1));
+    targets = preparing, voxel_grid, surface_normals, descriptors, signatures, nearest_grid, matching,
+        second_order_consensus, verification, alignment, whole_pair, triplet_support
+}
+criterion_main!(engine);
