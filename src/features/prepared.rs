@@ -4,7 +4,7 @@
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::fpfh::{DESCRIPTOR_LEN, fpfh};
+use super::fpfh::{Descriptor, fpfh};
 use super::keypoints::select_keypoints;
 use super::planes::PlaneProfile;
 use super::range_image::RangeImage;
@@ -204,11 +204,9 @@ pub fn prepare(
     control.check()?;
     let mut rng = options.seed.derive("keypoints", key.0);
     let keypoints = select_keypoints(&mut rng, &all, options.keypoints);
-    let mut descriptors = Vec::with_capacity(keypoints.len() * DESCRIPTOR_LEN);
-    for &keypoint in &keypoints {
-        descriptors.extend_from_slice(&all[keypoint as usize]);
-    }
-    let signature = signature(&all);
+    let chosen: Vec<Descriptor> = keypoints.iter().map(|keypoint| all[*keypoint as usize]).collect();
+    let signature = signature(&chosen);
+    let descriptors = chosen.concat();
     Ok(PreparedScan {
         key,
         resolution,

@@ -1,8 +1,8 @@
 //! A scan's global signature: what kinds of surface it holds, as one short vector, for retrieval.
 //!
-//! It is the mean of random Fourier features of the scan's descriptors (Rahimi, Recht: "Random Features for Large-Scale Kernel
-//! Machines", 2007), that is, the kernel mean embedding of their distribution: scans that see the same things have close
-//! signatures. Unlike a learned vocabulary it needs no training data and is the same for every project.
+//! It is the mean of random Fourier features of the descriptors of the scan's keypoints (Rahimi, Recht: "Random Features for
+//! Large-Scale Kernel Machines", 2007), that is, the kernel mean embedding of their distribution: scans that see the same things
+//! have close signatures. Keypoints are rare points above all, so it tells of what is there beside walls and floors. Unlike a learned vocabulary it needs no training data and is the same for every project.
 
 use multiversion::multiversion;
 use rand::{Rng, SeedableRng};
@@ -14,7 +14,7 @@ use crate::control::SeedRng;
 /// Numbers in a signature.
 pub const SIGNATURE_LEN: usize = 512;
 /// Inverse width of the Gaussian kernel between unit-length descriptors.
-const KERNEL_SCALE: f32 = 4.0;
+const KERNEL_SCALE: f32 = 8.0;
 /// The features are part of the format of prepared scans, so this never follows a project's seed.
 const FEATURE_SEED: u64 = 0x5167_7265;
 

@@ -28,7 +28,12 @@ pub struct Match {
 /// broken by keypoint number.
 #[must_use]
 pub fn mutual_matches(a: &PreparedScan, b: &PreparedScan, limit: usize) -> Vec<Match> {
-    let (rows, columns) = (a.keypoints.len(), b.keypoints.len());
+    mutual(&a.descriptors, &b.descriptors, limit)
+}
+
+/// The same of any descriptors, each [`DESCRIPTOR_LEN`] numbers; keypoint numbers count from the first given.
+pub(super) fn mutual(a: &[f32], b: &[f32], limit: usize) -> Vec<Match> {
+    let (rows, columns) = (a.len() / DESCRIPTOR_LEN, b.len() / DESCRIPTOR_LEN);
     if rows == 0 || columns == 0 {
         return Vec::new();
     }
@@ -38,7 +43,7 @@ pub fn mutual_matches(a: &PreparedScan, b: &PreparedScan, limit: usize) -> Vec<M
     let nothing = vec![NOTHING; columns];
     for first in (0..rows).step_by(BLOCK) {
         let height = BLOCK.min(rows - first);
-        similarities(&a.descriptors[first * DESCRIPTOR_LEN..], &b.descriptors, height, columns, &mut block);
+        similarities(&a[first * DESCRIPTOR_LEN..], b, height, columns, &mut block);
         for row in (0..height).step_by(TOGETHER) {
             let lines: [&[f32]; TOGETHER] = std::array::from_fn(|k| {
                 if row + k < height { &block[(row + k) * columns..(row + k + 1) * columns] } else { &nothing }

@@ -9,6 +9,7 @@ mod icp;
 mod matching;
 mod pair;
 mod planar;
+mod probe;
 mod shortlist;
 mod verifier;
 
@@ -18,6 +19,7 @@ pub use icp::{icp, perturbed_about};
 pub use matching::{Match, mutual_matches};
 pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};
 pub use planar::planar_poses;
+pub use probe::{Probe, probe};
 pub use shortlist::shortlist;
 pub use verifier::{
     Evidence, FEATURES, Logistic, TRIPLET_FEATURES, Verifier, VerifierError, shipped_verifier,
