@@ -23,6 +23,8 @@ pub mod optimize;
 
 pub mod mapping;
 
+pub mod baseline;
+
 pub mod evaluate;
 pub mod simulate;
 

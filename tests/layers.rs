@@ -14,6 +14,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("graph", &["geometry", "cloud", "features", "pairwise"]),
     ("optimize", &["geometry"]),
     ("mapping", &["geometry", "cloud", "features", "pairwise", "graph", "optimize"]),
+    ("baseline", &["geometry", "cloud", "features", "pairwise", "graph", "optimize"]),
     ("evaluate", &["geometry", "cloud"]),
     ("simulate", &["geometry", "cloud"]),
     ("project", &["geometry"]),
@@ -33,8 +34,8 @@ const ALLOWED: &[(&str, &[&str])] = &[
 const SERVICE_CRATES: &[&str] =
     &["tokio", "axum", "sqlx", "reqwest", "tower", "std::fs", "std::net", "SystemTime"];
 const CORE: &[&str] = &[
-    "control", "geometry", "cloud", "features", "pairwise", "graph", "optimize", "mapping", "evaluate",
-    "simulate",
+    "control", "geometry", "cloud", "features", "pairwise", "graph", "optimize", "mapping", "baseline",
+    "evaluate", "simulate",
 ];
 
 fn sources(folder: &Path, found: &mut Vec<PathBuf>) {

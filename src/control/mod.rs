@@ -8,7 +8,7 @@ mod observer;
 mod seed;
 
 pub use cancel::{CancelToken, Cancelled};
-pub use observer::{Observer, Progress, Silent, Stage};
+pub use observer::{Observer, Ongoing, Progress, Silent, Stage};
 pub use seed::{Seed, SeedRng};
 
 /// What a long computation is given besides its inputs.
@@ -20,10 +20,16 @@ pub struct Control<'a> {
     pub observer: &'a dyn Observer,
 }
 
-impl Control<'_> {
+impl<'a> Control<'a> {
     /// Returns `Err(Cancelled)` once the caller has cancelled.
     pub fn check(&self) -> Result<(), Cancelled> {
         self.cancel.check()
+    }
+
+    /// Tells the observer that a stage begins, and, when the returned value is dropped, that it has ended. For work of the
+    /// calling thread, whatever pool it is spread over.
+    pub fn begin(&self, stage: Stage) -> Ongoing<'a> {
+        Ongoing::begin(self.observer, stage)
     }
 
     /// Reports that `done` of `total` units of `stage` are finished.

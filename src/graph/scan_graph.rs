@@ -135,6 +135,7 @@ impl ScanGraph {
             .filter(|pair| !self.edges.contains_key(pair))
             .filter_map(|pair| Some((self.scans.get(&pair.a)?, self.scans.get(&pair.b)?)))
             .collect();
+        let matching = control.begin(Stage::Match);
         let done = std::sync::atomic::AtomicUsize::new(0);
         let results: Vec<PairResult> = fresh
             .par_iter()
@@ -146,6 +147,8 @@ impl ScanGraph {
                 Ok(result)
             })
             .collect::<Result<_, Cancelled>>()?;
+        drop(matching);
+        let _supporting = control.begin(Stage::Support);
         self.add_results(results.iter().cloned(), options);
         Ok(results)
     }

@@ -9,7 +9,7 @@ use super::component::Component;
 use super::options::MappingOptions;
 use super::surfaces::ComponentSurfaces;
 use crate::cloud::ScanKey;
-use crate::control::{Cancelled, Control};
+use crate::control::{Cancelled, Control, Stage};
 use crate::geometry::{Kernel, Pose};
 use crate::graph::{ScanGraph, softplus};
 use crate::optimize::{
@@ -108,6 +108,7 @@ pub fn local_bundle_adjustment(
     options: &MappingOptions,
     control: Control<'_>,
 ) -> Result<(), Cancelled> {
+    let _adjusting = control.begin(Stage::BundleAdjustment);
     let gauge = component.gauge;
     let free = neighborhood(component, scan, options);
     let indexed = Indexed::new(component);
@@ -134,6 +135,7 @@ pub fn global_bundle_adjustment(
     options: &MappingOptions,
     control: Control<'_>,
 ) -> Result<Option<Report>, Cancelled> {
+    let _adjusting = control.begin(Stage::BundleAdjustment);
     let tolerance = options.track_voxels * voxel;
     let mut last = None;
     for round in 0..GLOBAL_ROUNDS {
@@ -184,6 +186,7 @@ pub fn pose_graph(
     options: &MappingOptions,
     control: Control<'_>,
 ) -> Result<(), Cancelled> {
+    let _adjusting = control.begin(Stage::DenseRefinement);
     let indexed = Indexed::new(component);
     let mut edges = Vec::new();
     for edge in graph.edges() {
@@ -241,6 +244,7 @@ pub fn dense(
     voxel: f64,
     control: Control<'_>,
 ) -> Result<Option<DenseOutcome>, Cancelled> {
+    let _adjusting = control.begin(Stage::DenseRefinement);
     let indexed = Indexed::new(component);
     let is_free = |key: &ScanKey| free.is_none_or(|free| free.contains(key));
     let surfaces = ComponentSurfaces::new(graph, component, is_free, DENSE_POINTS);
