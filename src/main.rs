@@ -38,7 +38,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Register(args) => return register::run(&args),
         Command::Demo(args) => return demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args)?,
-        Command::Bench(args) => bench::run(&args)?,
+        Command::Bench(args) => return bench::run(&args),
         Command::Simulate(args) => simulate::run(&args)?,
         Command::Openapi(args) => openapi::run(args)?,
     }

@@ -3,17 +3,14 @@
 //! Reads files and prints; all measures are in [`crate::evaluate`].
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use serde::Serialize;
 
-use crate::evaluate::{Ecdf, EcdfStep, Estimate, Recall, Tolerance, TruthReport, against_truth, recall};
-use crate::geometry::pose_text::{parse_info, parse_log};
-
-/// The benchmarks that a scene folder may hold.
-const BENCHMARKS: [&str; 2] = ["3DMatch", "3DLoMatch"];
+use super::truth::{PairList, label, pair_lists, read_estimate};
+use crate::evaluate::{Ecdf, EcdfStep, Recall, Tolerance, TruthReport, against_truth, recall};
 
 /// Measure how good estimated poses are.
 ///
@@ -120,9 +117,10 @@ fn evaluate(args: &EvaluateArgs) -> anyhow::Result<Report> {
         let estimate = read_estimate(path)?;
         let scene = args.scene.get(index);
         let mut benchmarks = Vec::new();
-        for (benchmark, log, info) in benchmark_files(args, scene)? {
-            benchmarks
-                .push(BenchmarkReport { benchmark, recall: read_recall(&estimate, &log, &info, args.tau)? });
+        for list in lists(args, scene)? {
+            let recall = recall(&estimate, &list.pairs, &list.weights, args.tau)
+                .with_context(|| list.files.clone())?;
+            benchmarks.push(BenchmarkReport { benchmark: list.name, recall });
         }
         let tolerance = Tolerance { rotation_deg: args.max_rotation, translation_m: args.max_translation };
         let truth = match args.truth.get(index) {
@@ -139,46 +137,15 @@ fn evaluate(args: &EvaluateArgs) -> anyhow::Result<Report> {
     Ok(Report { tau_m: args.tau, mean: means(&estimates), estimates })
 }
 
-/// Name, log and info of each benchmark that an estimate is measured on.
-fn benchmark_files(
-    args: &EvaluateArgs,
-    scene: Option<&PathBuf>,
-) -> anyhow::Result<Vec<(String, PathBuf, PathBuf)>> {
+/// The pairs that an estimate is measured on.
+fn lists(args: &EvaluateArgs, scene: Option<&PathBuf>) -> anyhow::Result<Vec<PairList>> {
     let Some(scene) = scene else {
         let files = args.gt_log.iter().zip(&args.gt_info);
-        return Ok(files.map(|(log, info)| (label(log), log.clone(), info.clone())).collect());
+        return files.map(|(log, info)| PairList::read(label(log), log, info)).collect();
     };
-    let files: Vec<_> = BENCHMARKS
-        .iter()
-        .map(|name| {
-            let file = |extension| scene.join(format!("{name}_gt.{extension}"));
-            ((*name).to_owned(), file("log"), file("info"))
-        })
-        .filter(|(_, log, _)| log.exists())
-        .collect();
-    ensure!(!files.is_empty(), "{} holds neither 3DMatch_gt.log nor 3DLoMatch_gt.log", scene.display());
-    Ok(files)
-}
-
-fn read_recall(estimate: &Estimate, log: &Path, info: &Path, tau_m: f64) -> anyhow::Result<Recall> {
-    let pairs = parse_log(&read(log)?).with_context(|| format!("{}", log.display()))?;
-    let weights = parse_info(&read(info)?).with_context(|| format!("{}", info.display()))?;
-    recall(estimate, &pairs, &weights, tau_m)
-        .with_context(|| format!("{} and {}", log.display(), info.display()))
-}
-
-fn read_estimate(path: &Path) -> anyhow::Result<Estimate> {
-    Estimate::parse(&read(path)?).with_context(|| format!("{}", path.display()))
-}
-
-fn read(path: &Path) -> anyhow::Result<String> {
-    std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
-}
-
-/// The last part of a path, for a table.
-fn label(path: impl AsRef<Path>) -> String {
-    let path = path.as_ref();
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+    let lists = pair_lists(scene)?;
+    ensure!(!lists.is_empty(), "{} holds neither 3DMatch_gt.log nor 3DLoMatch_gt.log", scene.display());
+    Ok(lists)
 }
 
 fn means(estimates: &[EstimateReport]) -> Vec<MeanRecall> {
@@ -262,7 +229,7 @@ fn truth_tables(text: &mut String, truth: &TruthReport) {
             let _ = writeln!(text, "    wrong: {} by {degrees:.1} deg and {metres:.2} m", wrong.name);
         }
     }
-    let Ecdf { pairs, connected, rotation_deg, translation_m } = &truth.pairs;
+    let Ecdf { pairs, connected, rotation_deg, translation_m, .. } = &truth.pairs;
     let _ = writeln!(text, "  relative poses of all {pairs} pairs ({connected} connected), share below:");
     let _ = writeln!(text, "    rotation    {}", curve(rotation_deg, "deg"));
     let _ = writeln!(text, "    translation {}", curve(translation_m, "m"));

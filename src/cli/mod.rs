@@ -9,3 +9,4 @@ pub mod register;
 pub mod serve;
 mod signals;
 pub mod simulate;
+mod truth;

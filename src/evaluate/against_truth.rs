@@ -29,7 +29,7 @@ impl Default for Tolerance {
 }
 
 impl Tolerance {
-    fn holds(&self, (angle_rad, distance_m): (f64, f64)) -> bool {
+    pub(super) fn holds(&self, (angle_rad, distance_m): (f64, f64)) -> bool {
         angle_rad.to_degrees() < self.rotation_deg && distance_m < self.translation_m
     }
 }
@@ -43,6 +43,8 @@ pub struct WrongScan {
     pub rotation_deg: f64,
     /// Metres.
     pub translation_m: f64,
+    /// It is of another place than most of its component. If the frames of the two are unrelated, so is the error to anything.
+    pub elsewhere: bool,
 }
 
 /// One component of the estimate.
@@ -95,11 +97,12 @@ pub struct TruthReport {
 struct PosedTwice<'a> {
     name: &'a str,
     truth_from_scan: Pose,
+    place: &'a str,
     model_from_scan: Pose,
 }
 
-/// Compares an estimate with true poses, all of which are in one frame. Scans alone in their component say nothing and
-/// count as not registered.
+/// Compares an estimate with true poses. The components of the truth are places of their own: in a component of the estimate, the scans
+/// of all places but one are wrong. Scans alone in their component say nothing and count as not registered.
 #[must_use]
 pub fn against_truth(estimate: &Estimate, truth: &Estimate, tolerance: Tolerance) -> TruthReport {
     let mut by_component: BTreeMap<&str, Vec<PosedTwice<'_>>> = BTreeMap::new();
@@ -108,15 +111,16 @@ pub fn against_truth(estimate: &Estimate, truth: &Estimate, tolerance: Tolerance
             by_component.entry(&placed.component).or_default().push(PosedTwice {
                 name,
                 truth_from_scan: scan.model_from_scan,
+                place: &scan.component,
                 model_from_scan: placed.model_from_scan,
             });
         }
     }
     let (mut components, mut errors) = (Vec::new(), Vec::new());
     for (component, scans) in by_component.iter().filter(|(_, scans)| scans.len() > 1) {
-        let truth_from_model = align(scans, tolerance);
-        let of_scans: Vec<(f64, f64)> = scans.iter().map(|scan| scan.error(&truth_from_model)).collect();
-        components.push(component_report(component, scans, &of_scans, tolerance));
+        let laid = align(scans, tolerance);
+        let of_scans: Vec<(f64, f64)> = scans.iter().map(|scan| scan.error(&laid.truth_from_model)).collect();
+        components.push(component_report(component, scans, &of_scans, laid.place, tolerance));
         errors.extend(of_scans);
     }
     components.sort_by(|a, b| b.scans.cmp(&a.scans).then_with(|| a.component.cmp(&b.component)));
@@ -142,12 +146,18 @@ impl PosedTwice<'_> {
     }
 }
 
-/// The motion that lays most scans of a component on the truth.
-fn align(scans: &[PosedTwice<'_>], tolerance: Tolerance) -> Pose {
+/// A component laid on a place of the truth.
+struct Laid<'a> {
+    truth_from_model: Pose,
+    place: &'a str,
+}
+
+/// The motion that lays most scans of a component on the truth of one place.
+fn align<'a>(scans: &[PosedTwice<'a>], tolerance: Tolerance) -> Laid<'a> {
     // More right scans first; among equals, the smaller error of the right ones in units of the tolerance.
-    let score = |truth_from_model: &Pose| {
+    let score = |truth_from_model: &Pose, place: &str| {
         let (mut right, mut off) = (0usize, 0.0);
-        for scan in scans {
+        for scan in scans.iter().filter(|scan| scan.place == place) {
             let error = scan.error(truth_from_model);
             if tolerance.holds(error) {
                 right += 1;
@@ -156,24 +166,28 @@ fn align(scans: &[PosedTwice<'_>], tolerance: Tolerance) -> Pose {
         }
         (right, -off)
     };
-    let proposals = scans.iter().map(|scan| scan.truth_from_scan * scan.model_from_scan.inverse());
     let mut best = Pose::identity();
+    let mut place = "";
     let mut best_score = (0, f64::NEG_INFINITY);
-    for proposal in proposals {
-        let proposed = score(&proposal);
+    for scan in scans {
+        let proposal = scan.truth_from_scan * scan.model_from_scan.inverse();
+        let proposed = score(&proposal, scan.place);
         if proposed.0 > best_score.0 || (proposed.0 == best_score.0 && proposed.1 > best_score.1) {
-            (best, best_score) = (proposal, proposed);
+            (best, place, best_score) = (proposal, scan.place, proposed);
         }
     }
+    let of_place = || scans.iter().filter(|scan| scan.place == place);
     for _ in 0..5 {
-        let refined = mean_motion(scans.iter().filter(|scan| tolerance.holds(scan.error(&best))));
-        let Some((refined, refined_score)) = refined.map(|refined| (refined, score(&refined))) else { break };
+        let refined = mean_motion(of_place().filter(|scan| tolerance.holds(scan.error(&best))));
+        let Some((refined, refined_score)) = refined.map(|refined| (refined, score(&refined, place))) else {
+            break;
+        };
         if refined_score.0 < best_score.0 || refined_score == best_score {
             break;
         }
         (best, best_score) = (refined, refined_score);
     }
-    best
+    Laid { truth_from_model: best, place }
 }
 
 /// The chordal mean of the rotations that take estimate to truth, and the translation that fits best under it.
@@ -196,16 +210,18 @@ fn component_report(
     component: &str,
     scans: &[PosedTwice<'_>],
     errors: &[(f64, f64)],
+    place: &str,
     tolerance: Tolerance,
 ) -> ComponentReport {
     let mut wrong: Vec<WrongScan> = scans
         .iter()
         .zip(errors)
-        .filter(|(_, error)| !tolerance.holds(**error))
+        .filter(|(scan, error)| scan.place != place || !tolerance.holds(**error))
         .map(|(scan, error)| WrongScan {
             name: scan.name.to_owned(),
             rotation_deg: error.0.to_degrees(),
             translation_m: error.1,
+            elsewhere: scan.place != place,
         })
         .collect();
     wrong.sort_by(|a, b| b.translation_m.total_cmp(&a.translation_m).then_with(|| a.name.cmp(&b.name)));
@@ -224,7 +240,7 @@ fn component_report(
 }
 
 /// The middle value; the mean of the two middle ones of an even number.
-fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+pub(super) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
     let upper = *values.get(values.len() / 2)?;
@@ -301,6 +317,18 @@ mod tests {
         assert_eq!(report.components.iter().map(|c| c.scans).collect::<Vec<_>>(), [4, 2]);
         // Two scans 50 mm apart from the truth share the error.
         assert!((report.components[1].worst_translation_mm - 25.0).abs() < 1.0, "{:?}", report.components[1]);
+    }
+
+    #[test]
+    fn scans_of_another_place_are_wrong_wherever_they_are_put() {
+        let mut places = truth();
+        for name in ["s0.ply", "s6.ply"] {
+            places.placed.get_mut(name).unwrap().component = "next door".to_owned();
+        }
+        let report = against_truth(&moved(truth()), &places, Tolerance::default());
+        assert_eq!((report.registered, report.right, report.wrong), (7, 5, 2));
+        assert!(report.components[0].wrong.iter().all(|wrong| wrong.elsewhere), "{report:?}");
+        assert_eq!((report.pairs.pairs, report.pairs.connected), (11, 11));
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::Estimate;
+use super::against_truth::median;
 
 /// Rotation thresholds of the literature, degrees.
 pub const ROTATION_STEPS_DEG: [f64; 5] = [3.0, 5.0, 10.0, 30.0, 45.0];
@@ -22,7 +23,7 @@ pub struct EcdfStep {
 /// The curves of an estimate.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Ecdf {
-    /// All pairs of scans with a true pose.
+    /// All pairs of scans with true poses in one frame.
     pub pairs: usize,
     /// Pairs of which both scans are registered, in one component. The others count as failed at every threshold.
     pub connected: usize,
@@ -30,17 +31,29 @@ pub struct Ecdf {
     pub rotation_deg: Vec<EcdfStep>,
     /// At [`TRANSLATION_STEPS_M`].
     pub translation_m: Vec<EcdfStep>,
+    /// Mean over connected pairs, degrees; `None` without any.
+    pub mean_rotation_deg: Option<f64>,
+    /// Median over connected pairs, degrees.
+    pub median_rotation_deg: Option<f64>,
+    /// Mean over connected pairs, metres.
+    pub mean_translation_m: Option<f64>,
+    /// Median over connected pairs, metres.
+    pub median_translation_m: Option<f64>,
 }
 
-/// Compares the relative poses of all pairs of true scans: the angle of `(T_i^-1 T_j)^-1 (X_i^-1 X_j)`, and the distance of the
+/// Compares the relative poses of all pairs of scans of one component of the truth: the angle of `(T_i^-1 T_j)^-1 (X_i^-1 X_j)`, and the distance of the
 /// two translations, metres.
 #[must_use]
 pub fn ecdf(estimate: &Estimate, truth: &Estimate) -> Ecdf {
     let scans: Vec<_> = truth.placed.iter().map(|(name, scan)| (scan, estimate.find(name))).collect();
-    let mut errors = Vec::new();
+    let (mut pairs, mut errors) = (0, Vec::new());
     for (index, (true_i, estimated_i)) in scans.iter().enumerate() {
-        let Some(estimated_i) = estimated_i else { continue };
         for (true_j, estimated_j) in scans.iter().skip(index + 1) {
+            if true_i.component != true_j.component {
+                continue;
+            }
+            pairs += 1;
+            let Some(estimated_i) = estimated_i else { continue };
             let Some(estimated_j) = estimated_j.filter(|j| j.component == estimated_i.component) else {
                 continue;
             };
@@ -49,7 +62,6 @@ pub fn ecdf(estimate: &Estimate, truth: &Estimate) -> Ecdf {
             errors.push(true_i_from_j.difference(&i_from_j));
         }
     }
-    let pairs = scans.len() * scans.len().saturating_sub(1) / 2;
     let curve = |steps: &[f64], error: &dyn Fn(&(f64, f64)) -> f64| {
         let below = |threshold: f64| errors.iter().filter(|e| error(e) < threshold).count() as f64;
         let share = |threshold| if pairs == 0 { 0.0 } else { below(threshold) / pairs as f64 };
@@ -60,7 +72,16 @@ pub fn ecdf(estimate: &Estimate, truth: &Estimate) -> Ecdf {
         connected: errors.len(),
         rotation_deg: curve(&ROTATION_STEPS_DEG, &|e| e.0.to_degrees()),
         translation_m: curve(&TRANSLATION_STEPS_M, &|e| e.1),
+        mean_rotation_deg: mean(errors.iter().map(|e| e.0.to_degrees())),
+        median_rotation_deg: median(errors.iter().map(|e| e.0.to_degrees())),
+        mean_translation_m: mean(errors.iter().map(|e| e.1)),
+        median_translation_m: median(errors.iter().map(|e| e.1)),
     }
+}
+
+fn mean(values: impl ExactSizeIterator<Item = f64>) -> Option<f64> {
+    let count = values.len();
+    (count > 0).then(|| values.sum::<f64>() / count as f64)
 }
 
 #[cfg(test)]

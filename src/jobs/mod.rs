@@ -28,4 +28,5 @@ pub use compute::{Compute, Panicked};
 pub use error::JobError;
 pub use exports::{CloudRequest, ComponentChoice, ExportError, Exports};
 pub use intake::{Intake, IntakeError, UploadRequest};
+pub use parameters::DECIDING_SCANS;
 pub use workers::{WorkerOptions, Workers};

@@ -12,7 +12,7 @@ use crate::storage::{StorageError, Store};
 const ENGINE: &str = "engine/3";
 
 /// How many scans, by arrival, decide a project's resolution.
-pub(super) const DECIDING_SCANS: u32 = 8;
+pub const DECIDING_SCANS: u32 = 8;
 
 /// The engine's parameters for one project.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,6 +1,20 @@
-//! `cairn bench`: what the engine is worth, measured on scenes with known truth. One file a measure.
+//! `cairn bench`: what the engine is worth, measured on scenes with known truth. Measures are in [`crate::evaluate`], other strategies
+//! in [`crate::baseline`]; here scenes are read, the engine is run and timed, and figures are printed. `pairs.rs` is a measure of its own;
+//! all other files are `recall`.
 
+mod clock;
+mod markdown;
+mod measure;
+mod memory;
 mod pairs;
+mod published;
+mod recall;
+mod report;
+mod scene;
+mod tables;
+mod trial;
+
+use std::process::ExitCode;
 
 use clap::{Args, Subcommand};
 
@@ -13,6 +27,7 @@ pub struct BenchArgs {
 
 #[derive(Debug, Clone, Subcommand)]
 enum Measure {
+    Recall(recall::RecallArgs),
     Pairs(pairs::PairsArgs),
 }
 
@@ -20,8 +35,9 @@ enum Measure {
 ///
 /// # Errors
 /// Names the file that cannot be read, or what does not fit together.
-pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
+pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     match &args.measure {
-        Measure::Pairs(args) => pairs::run(args),
+        Measure::Recall(args) => recall::run(args),
+        Measure::Pairs(args) => pairs::run(args).map(|()| ExitCode::SUCCESS),
     }
 }

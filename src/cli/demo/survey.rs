@@ -50,7 +50,7 @@ impl DemoSurvey {
     pub fn of_folder(given: &Path, seed: Seed, dir: &Path) -> anyhow::Result<Self> {
         let inner = given.join("scans");
         let folder: PathBuf = if inner.is_dir() { inner } else { given.to_owned() };
-        let mut files = gather(std::slice::from_ref(&folder), dir)?.files;
+        let mut files = gather(std::slice::from_ref(&folder), Some(dir))?.files;
         files.shuffle(&mut seed.derive("demo.deal", 0));
         let half = files.len().div_ceil(RIGS);
         let second = files.split_off(half);

@@ -36,9 +36,9 @@ pub(in crate::cli) struct Inputs {
 /// ones are left out. A file that is named itself is always taken, so that it is reported if it cannot be read.
 ///
 /// # Errors
-/// Where a folder cannot be listed, is `out`, or there is no file at all.
-pub(in crate::cli) fn gather(scans: &[PathBuf], out: &Path) -> anyhow::Result<Inputs> {
-    let out = out.canonicalize().ok();
+/// Where a folder cannot be listed, is the folder `out` for results, or there is no file at all.
+pub(in crate::cli) fn gather(scans: &[PathBuf], out: Option<&Path>) -> anyhow::Result<Inputs> {
+    let out = out.and_then(|out| out.canonicalize().ok());
     let (mut paths, mut ignored) = (BTreeSet::new(), BTreeSet::new());
     for path in scans {
         if !path.is_dir() {
@@ -159,11 +159,11 @@ mod tests {
         let picture = file("a.ply", "\u{89}PNG");
         let scans = folder.path().join("scans");
         let out = folder.path().join("out");
-        let found = gather(&[scans.clone(), picture, scans.join("../scans/a.ply")], &out).unwrap();
+        let found = gather(&[scans.clone(), picture, scans.join("../scans/a.ply")], Some(&out)).unwrap();
         let names: Vec<&str> = found.files.iter().map(|f| f.name.as_str()).collect();
         assert_eq!(names[1..], ["b.dat", "scans/a.ply"]);
         assert!(names[0].ends_with("/a.ply"), "{names:?}");
         assert_eq!(found.ignored, ["poses.json"]);
-        assert!(gather(std::slice::from_ref(&scans), &scans).is_err());
+        assert!(gather(std::slice::from_ref(&scans), Some(&scans)).is_err());
     }
 }

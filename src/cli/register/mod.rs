@@ -6,7 +6,7 @@
 
 pub(super) mod inputs;
 mod output;
-mod pipeline;
+pub(super) mod pipeline;
 mod poses;
 mod report;
 pub(super) mod source;
@@ -84,7 +84,7 @@ pub fn run(args: &RegisterArgs) -> anyhow::Result<ExitCode> {
     settings.validate()?;
     let interpretation = Interpretation { metres_per_unit: args.units, sensor_position: None };
     interpretation.validate()?;
-    let inputs = inputs::gather(&args.scans, &args.out)?;
+    let inputs = inputs::gather(&args.scans, Some(&args.out))?;
     let mut staging = Staging::begin(&args.out, args.force)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build()?;
 

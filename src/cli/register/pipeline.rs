@@ -17,7 +17,7 @@ use crate::project::{Interpretation, ProjectSettings};
 
 /// A scan, in however many files its content is.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct DistinctScan {
+pub(in crate::cli) struct DistinctScan {
     /// Names of the files, ascending; the first stands for them all.
     pub names: Vec<String>,
     /// Where the first is.
@@ -25,7 +25,7 @@ pub(super) struct DistinctScan {
     /// Points in it.
     pub points: u64,
     /// The resolution that suits it alone, metres.
-    natural: f64,
+    pub natural: f64,
 }
 
 /// Scans and the model that was made of them.
@@ -74,10 +74,10 @@ impl Registration {
     }
 }
 
-type Measured = (BTreeMap<ScanKey, DistinctScan>, BTreeMap<String, Failure>);
+pub(in crate::cli) type Measured = (BTreeMap<ScanKey, DistinctScan>, BTreeMap<String, Failure>);
 
 /// Decodes every file once, and keeps only what is known of it then. `files` are ascending by name.
-fn measure(
+pub(in crate::cli) fn measure(
     files: &[Input],
     interpretation: &Interpretation,
     control: Control<'_>,
@@ -115,10 +115,10 @@ fn measure(
     Ok((scans, unreadable))
 }
 
-type Prepared = (Vec<Arc<PreparedScan>>, BTreeMap<ScanKey, Failure>);
+pub(in crate::cli) type Prepared = (Vec<Arc<PreparedScan>>, BTreeMap<ScanKey, Failure>);
 
 /// Prepares every scan, in the order of their content.
-fn prepare_all(
+pub(in crate::cli) fn prepare_all(
     scans: &BTreeMap<ScanKey, DistinctScan>,
     interpretation: &Interpretation,
     options: &PrepareOptions,
