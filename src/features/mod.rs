@@ -16,5 +16,5 @@ pub use planes::{Offsets, PlaneProfile};
 pub use prepared::{PrepareError, PrepareOptions, PreparedScan, Scan, prepare};
 pub use range_image::{RangeImage, Visibility};
 pub use resolution::{choose_resolution, extent, natural_resolution};
-pub use sensor::{SensorPosition, Viewpoint, viewpoint};
+pub use sensor::{SensorPosition, Surfaces, Viewpoint, viewpoint};
 pub use signature::{SIGNATURE_LEN, signature};

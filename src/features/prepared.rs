@@ -9,7 +9,7 @@ use super::keypoints::select_keypoints;
 use super::planes::PlaneProfile;
 use super::range_image::RangeImage;
 use super::resolution::extent;
-use super::sensor::{SensorPosition, viewpoint};
+use super::sensor::{SensorPosition, Surfaces, viewpoint};
 use super::signature::signature;
 use crate::cloud::{PointCloud, ScanKey, face, normals};
 use crate::control::{Cancelled, Control, Seed};
@@ -190,7 +190,14 @@ pub fn prepare(
     control.check()?;
 
     let frame_origin = cloud.origin.map(|x| -x as f32);
-    let view = viewpoint(&fine, sensor, frame_origin, v, extent(&fine) as f32);
+    let surfaces = Surfaces {
+        points: &fine,
+        samples: &coarse,
+        normals: &raw_normals,
+        resolution: v,
+        extent: extent(&fine) as f32,
+    };
+    let view = viewpoint(&surfaces, sensor, frame_origin);
     control.check()?;
     let (points, normals): (Vec<Point>, Vec<Point>) = coarse
         .iter()
