@@ -39,7 +39,7 @@ function scanRow(scan) {
   const out = scan.outcome;
   let where = "";
   if (out?.status === "registered") where = `component ${out.component}, ${out.landmarks} landmarks, ${out.neighbours} neighbours`;
-  if (out?.status === "waiting") where = out.reason.replaceAll("-", " ");
+  if (out?.status === "waiting") where = because(out);
   if (out?.status === "failed") where = out.problem.detail;
   const path = `/v1/projects/${scan.project}/scans/${scan.id}`;
   return element("tr", {},
@@ -49,12 +49,56 @@ function scanRow(scan) {
     element("td", { class: "fix soft" }, scan.points ? `${scan.points.toLocaleString("en")} points` : bytes(scan.bytes)));
 }
 
+/** A reason in words. */
+function because(why) {
+  const n = (x) => x.toFixed(1);
+  const words = {
+    ambiguous: () => `ambiguous: support ${n(why.best_support)}, of another pose ${n(why.rival_support)}`,
+    contradicted: () => `contradicted: ${why.against} pairs are sure of another pose, ${why.agreeing} were of this one`,
+    "violates-free-space": () => `violates free space: ${n(100 * why.violation)} %, allowed ${n(100 * why.allowed)} %`,
+    "too-little-support": () => `too little support: ${n(why.best_support)}, needed ${n(why.needed)}`,
+  };
+  return words[why.reason]?.() ?? why.reason.replaceAll("-", " ");
+}
+
+function button(text, action) {
+  const made = element("button", {}, text);
+  made.addEventListener("click", () => act(action));
+  return made;
+}
+
+const post = (path, body) => api(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) });
+
+/** An open join with its poses, each of which may be chosen, and the choice of none. */
+function openJoinRow(open, own, version) {
+  const decide = (verdict, more) => () =>
+    post(`${own}/decisions`, { verdict, scan_a: open.scan_a.id, scan_b: open.scan_b.id, ...more });
+  const piece = (scan, scans) => scans > 1 ? `${scan.name} (with ${scans - 1} more)` : scan.name;
+  const poses = open.poses.map((pose, index) => element("p", {},
+    element("span", { class: "soft" }, `support ${pose.support.toFixed(1)} by ${pose.edges} edges, ${pose.inliers.toLocaleString("en")} inliers, ` +
+      `${(100 * pose.violation).toFixed(1)} % in free space`),
+    button("Join so", decide("join", { pose: index, version }))));
+  return element("tr", {},
+    element("td", {}, `${piece(open.scan_a, open.scans_a)} – ${piece(open.scan_b, open.scans_b)}`,
+      element("div", { class: "soft" }, because(open.refusal))),
+    element("td", {}, ...poses),
+    element("td", { class: "fix" }, button("Keep apart", decide("forbid", {}))));
+}
+
+function decisionRow(decision, own, names) {
+  const name = (id) => names.get(id) ?? id;
+  const what = { join: "belong together", forbid: decision.a_from_b ? "do not belong together at one pose" : "do not belong together" };
+  return element("tr", {},
+    element("td", {}, `${name(decision.scan_a)} and ${name(decision.scan_b)} ${what[decision.verdict]}`),
+    element("td", { class: "fix" }, button("Take back", () => api(`${own}/decisions/${decision.id}`, { method: "DELETE" }))));
+}
+
 function jobRow(job, names) {
   const open = job.status === "running" || job.status === "accepted";
   let what = job.outcome ? `${job.outcome.status}, version ${job.outcome.version}` : job.problem?.detail ?? "";
   if (open) what = job.stage ?? "queued";
   const bar = open ? element("progress", { max: 100, value: job.progress }) : null;
-  const dismiss = open && job.kind !== "removal" ? element("button", {}, "Dismiss") : null;
+  const dismiss = open && !["removal", "decision"].includes(job.kind) ? element("button", {}, "Dismiss") : null;
   dismiss?.addEventListener("click", () => act(() => api(`/v1/jobs/${job.id}`, { method: "DELETE" })));
   return element("tr", {},
     element("td", {}, job.kind.replaceAll("-", " "), " ", element("span", { class: "soft" }, names.get(job.scan) ?? "")),
@@ -79,7 +123,7 @@ async function showProject(project) {
   $("nothing").hidden = Boolean(project);
   if (!project) return;
   const own = `/v1/projects/${project.id}`;
-  const [scans, jobs] = await Promise.all([all(`${own}/scans`), all(`${own}/jobs`)]);
+  const [scans, jobs, decisions] = await Promise.all(["scans", "jobs", "decisions"].map((list) => all(`${own}/${list}`)));
   const names = new Map(scans.map((s) => [s.id, s.name]));
   const count = (word) => scans.filter((s) => s.state === word).length;
   $("name").textContent = project.name;
@@ -89,17 +133,23 @@ async function showProject(project) {
   const ended = jobs.filter((j) => j.finished).reverse().slice(0, Math.max(4, 12 - open.length));
   $("jobs").replaceChildren(...[...open, ...ended].map((j) => jobRow(j, names)));
   $("scans").replaceChildren(...scans.map(scanRow));
-  showVersion(project, own);
+  $("decided").hidden = decisions.length === 0;
+  $("decisions").replaceChildren(...decisions.map((d) => decisionRow(d, own, names)));
+  await showVersion(project, own);
 }
 
-function showVersion(project, own) {
+async function showVersion(project, own) {
   const version = `${project.id}/${project.version}`;
   if (version === shownVersion) return;
+  const some = project.version > 0;
+  const model = await api(some ? `${own}/versions/${project.version}` : `${own}/model`);
+  if (project.id !== chosen()) return;
   shownVersion = version;
+  $("open").hidden = model.open_joins.length === 0;
+  $("open-joins").replaceChildren(...model.open_joins.map((open) => openJoinRow(open, own, model.version)));
   const at = `version=${project.version}`;
   const links = [["merged cloud", `cloud?${at}`], ["poses (json)", `poses?${at}`], ["poses (TUM)", `poses?format=tum&${at}`],
     ["poses (3DMatch log)", `poses?format=3dmatch-log&${at}`], ["graph", `graph?${at}`], ["model", `versions/${project.version}`]];
-  const some = project.version > 0;
   $("downloads").replaceChildren(...(some ? links.map(([text, path]) => element("a", { href: `${own}/${path}` }, text)) : []));
   const picture = $("preview");
   picture.onload = () => { picture.hidden = false; };
@@ -133,19 +183,14 @@ async function upload(files) {
 $("new-project").addEventListener("submit", (event) => {
   event.preventDefault();
   act(async () => {
-    const body = JSON.stringify({ name: $("new-name").value });
-    const made = await api("/v1/projects", { method: "POST", headers: { "content-type": "application/json" }, body });
+    const made = await post("/v1/projects", { name: $("new-name").value });
     $("new-name").value = "";
     location.hash = made.id;
   });
 });
 $("files").addEventListener("change", (event) => act(() => upload([...event.target.files])));
-for (const button of document.querySelectorAll("[data-kind]")) {
-  button.addEventListener("click", () => act(() => api(`/v1/projects/${chosen()}/jobs`, {
-    method: "POST",
-    headers: { "content-type": "application/json" },
-    body: JSON.stringify({ kind: button.dataset.kind }),
-  })));
+for (const asked of document.querySelectorAll("[data-kind]")) {
+  asked.addEventListener("click", () => act(() => post(`/v1/projects/${chosen()}/jobs`, { kind: asked.dataset.kind })));
 }
 addEventListener("hashchange", () => refresh().catch(() => {}));
 

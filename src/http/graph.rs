@@ -7,6 +7,7 @@ use utoipa::ToSchema;
 
 use super::extract::Ids;
 use super::model::{ComponentBody, components};
+use super::open_join::{Names, OpenJoinBody, UndoneBody};
 use super::problem::{Problem, Problems};
 use super::query::Params;
 use super::router::Api;
@@ -56,6 +57,10 @@ pub(super) struct GraphBody {
     edges: Vec<EdgeBody>,
     /// Largest first.
     components: Vec<ComponentBody>,
+    /// Joins that were not made although something speaks for them, the best supported first.
+    open_joins: Vec<OpenJoinBody>,
+    /// Placements that later scans contradicted, and that this version took back.
+    undone: Vec<UndoneBody>,
 }
 
 /// Shows the scan graph.
@@ -82,10 +87,13 @@ pub(super) async fn get_graph(
     };
     let edge = |e: &Edge| EdgeBody { a: e.a, b: e.b, inliers: e.inliers, overlap: e.overlap, score: e.score };
     let edges = content.edges.iter();
+    let names = Names::needed(&api.store, project, &content).await?;
     Ok(Json(GraphBody {
         version,
         nodes: content.scans.iter().map(node).collect(),
         edges: edges.map(edge).collect(),
+        open_joins: names.open_joins(&content.open_joins),
+        undone: names.undone(&content.undone),
         components: components(content.components),
     }))
 }

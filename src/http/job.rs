@@ -43,7 +43,7 @@ pub(super) struct JobBody {
     /// The scan that it is about, for registrations and removals.
     #[schema(value_type = Option<String>)]
     scan: Option<ScanId>,
-    /// registration, global-bundle-adjustment, track-refinement, dense-refinement, rebuild or removal.
+    /// registration, global-bundle-adjustment, track-refinement, dense-refinement, rebuild, removal or decision.
     #[schema(value_type = String)]
     kind: JobKind,
     /// accepted, running, succeeded, failed or dismissed.
@@ -57,7 +57,8 @@ pub(super) struct JobBody {
     /// How often a worker has taken it up.
     attempt: u32,
     /// What came of it. For a registration: `status` registered (with `component` and `version`) or waiting (with the
-    /// `reason`).
+    /// `reason`). For work on the whole model: its `version`, and how many `components`, scans `registered`, `open_joins` and
+    /// placements `undone` that has.
     #[schema(value_type = Option<Object>)]
     outcome: Option<Value>,
     /// Why it failed.
@@ -144,7 +145,7 @@ pub(super) async fn create_job(
     ("status" = Option<String>, Query, description = "Only jobs with this status",
         pattern = "^(accepted|running|succeeded|failed|dismissed)$"),
     ("kind" = Option<String>, Query, description = "Only jobs of this kind",
-        pattern = "^(registration|global-bundle-adjustment|track-refinement|dense-refinement|rebuild|removal)$"),
+        pattern = "^(registration|global-bundle-adjustment|track-refinement|dense-refinement|rebuild|removal|decision)$"),
     ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer", pattern = "^[0-9a-f]{1,15}$"),
     ("limit" = Option<u32>, Query, description = "At most so many items, 1 to 200; 50 if absent", minimum = 1, maximum = 200)),
     responses((status = 200, description = "A part of the list", body = JobList), Problems))]
@@ -209,7 +210,7 @@ pub(super) async fn get_job(
 #[utoipa::path(delete, path = "/v1/jobs/{job}", tag = "jobs",
     params(("job" = String, Path, description = "Id of the job")), responses(
     (status = 200, description = "The dismissed job", body = JobBody),
-    (status = 409, description = "It has ended, or is a removal", body = Problem, content_type = "application/problem+json"),
+    (status = 409, description = "It has ended, or is a removal or a decision", body = Problem, content_type = "application/problem+json"),
     Problems))]
 pub(super) async fn dismiss_job(
     State(api): State<Api>,

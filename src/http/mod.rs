@@ -4,6 +4,7 @@
 //! answer; every error is problem+json ([`Problem`]).
 
 mod cloud;
+mod decision;
 mod download;
 mod events;
 mod extract;
@@ -12,6 +13,7 @@ mod health;
 mod job;
 mod link;
 mod model;
+mod open_join;
 mod page;
 mod pose;
 mod preview;

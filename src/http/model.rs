@@ -11,12 +11,13 @@ use utoipa::ToSchema;
 use super::download::none_match;
 use super::extract::Ids;
 use super::link::Link;
+use super::open_join::{Names, OpenJoinBody, UndoneBody};
 use super::problem::{Problem, Problems};
 use super::query::{Params, cursor};
 use super::router::Api;
 use super::scan::standing_body;
 use crate::project::{
-    Component, JobId, JobKind, ModelContent, ProjectId, ScanId, Timestamp, Version, VersionNumber,
+    Component, DecisionId, JobId, JobKind, ModelContent, ProjectId, ScanId, Timestamp, Version, VersionNumber,
 };
 
 /// One rigid piece of a model. Frames of different components are unrelated.
@@ -64,6 +65,13 @@ pub(super) struct ModelBody {
     components: Vec<ComponentBody>,
     /// Every scan that the model knows, in order of arrival.
     scans: Vec<StandingBody>,
+    /// Joins that were not made although something speaks for them, the best supported first.
+    open_joins: Vec<OpenJoinBody>,
+    /// Placements that later scans contradicted, and that this version took back.
+    undone: Vec<UndoneBody>,
+    /// The decisions that this version obeys; one that is taken back later stays here.
+    #[schema(value_type = Vec<String>)]
+    decisions: Vec<DecisionId>,
     /// Poses, cloud, graph and picture of this very version.
     links: Vec<Link>,
 }
@@ -105,7 +113,7 @@ pub(super) struct VersionList {
 }
 
 impl ModelBody {
-    fn new(project: ProjectId, version: VersionNumber, content: ModelContent) -> Self {
+    fn new(project: ProjectId, version: VersionNumber, content: ModelContent, names: &Names) -> Self {
         let own = format!("/v1/projects/{project}");
         let mut links = vec![Link::new("self", format!("{own}/versions/{version}"))];
         let exports = ["poses", "cloud", "graph", "preview"];
@@ -120,6 +128,9 @@ impl ModelBody {
                 .iter()
                 .map(|(scan, standing)| StandingBody { scan: *scan, outcome: standing_body(standing) })
                 .collect(),
+            open_joins: names.open_joins(&content.open_joins),
+            undone: names.undone(&content.undone),
+            decisions: content.decisions.iter().map(|(id, _)| *id).collect(),
             links,
         }
     }
@@ -170,7 +181,8 @@ pub(super) async fn get_model(
     let mut response = if none_match(&headers, &tag) {
         StatusCode::NOT_MODIFIED.into_response()
     } else {
-        Json(ModelBody::new(project, version, content)).into_response()
+        let names = Names::needed(&api.store, project, &content).await?;
+        Json(ModelBody::new(project, version, content, &names)).into_response()
     };
     response.headers_mut().insert(header::ETAG, HeaderValue::from_str(&tag).map_err(Problem::internal)?);
     Ok(response)
@@ -206,5 +218,6 @@ pub(super) async fn get_version(
     Ids((project, version)): Ids<(ProjectId, u32)>,
 ) -> Result<Json<ModelBody>, Problem> {
     let (version, content) = api.store.content(project, Some(VersionNumber(version))).await?;
-    Ok(Json(ModelBody::new(project, version, content)))
+    let names = Names::needed(&api.store, project, &content).await?;
+    Ok(Json(ModelBody::new(project, version, content, &names)))
 }

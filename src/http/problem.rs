@@ -105,16 +105,21 @@ impl From<StorageError> for Problem {
             StorageError::NoProject(_)
             | StorageError::NoScan(_)
             | StorageError::NoJob(_)
+            | StorageError::NoDecision(_)
             | StorageError::NoVersion(..) => Self::not_found(error.to_string()),
             StorageError::JobEnded(_) => Self::new(
                 StatusCode::CONFLICT,
                 "job-ended",
                 format!(
-                    "{error}: only jobs that are {} or {} can be dismissed, and removals cannot",
+                    "{error}: only jobs that are {} or {} can be dismissed, and removals and decisions cannot",
                     JobState::Accepted.as_str(),
                     JobState::Running.as_str()
                 ),
             ),
+            StorageError::TooManyDecisions { limit, .. } => Self {
+                limit: Some(limit.into()),
+                ..Self::new(StatusCode::CONFLICT, "too-many-decisions", error.to_string())
+            },
             other => Self::internal(other),
         }
     }

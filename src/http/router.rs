@@ -18,7 +18,9 @@ use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::{Problem, cloud, events, graph, health, job, model, page, pose, preview, project, scan, upload};
+use super::{
+    Problem, cloud, decision, events, graph, health, job, model, page, pose, preview, project, scan, upload,
+};
 use crate::jobs::{Exports, Intake};
 use crate::storage::Store;
 
@@ -49,6 +51,7 @@ pub struct Api {
         (name = "projects", description = "Sets of scans of one place"),
         (name = "scans", description = "Uploads"),
         (name = "jobs", description = "Work in progress, in the words of OGC API Processes"),
+        (name = "decisions", description = "What clients decide where the data alone cannot tell: identical rooms, symmetric halls"),
         (name = "model", description = "Versions of a project's model, and what can be downloaded of them"),
         (name = "service", description = "The service itself"),
     )
@@ -65,6 +68,8 @@ fn routes() -> OpenApiRouter<Api> {
         .routes(routes!(job::create_job, job::list_jobs))
         .routes(routes!(job::get_job, job::dismiss_job))
         .routes(routes!(events::follow_job))
+        .routes(routes!(decision::create_decision, decision::list_decisions))
+        .routes(routes!(decision::get_decision, decision::delete_decision))
         .routes(routes!(model::get_model))
         .routes(routes!(model::list_versions))
         .routes(routes!(model::get_version))

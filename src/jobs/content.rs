@@ -2,13 +2,14 @@
 
 use std::collections::HashMap;
 
-use serde_json::Value;
-
 use super::parameters::content_key;
+use super::reason::{reason_of, reason_of_refusal};
 use crate::cloud::ScanKey;
 use crate::graph::ScanGraph;
-use crate::mapping::{ModelSnapshot, ScanOutcome, WaitingReason};
-use crate::project::{Component, ContentKey, Edge, ModelContent, Placement, Reason, Scan, ScanId, Standing};
+use crate::mapping::{self, ModelSnapshot, ScanOutcome};
+use crate::project::{
+    Component, ContentKey, Edge, ModelContent, OpenJoin, Placement, RivalPose, Scan, ScanId, Standing, Undone,
+};
 
 /// The content of a version in the ids that clients know, scans in order of arrival.
 pub(super) fn content_of(
@@ -16,7 +17,8 @@ pub(super) fn content_of(
     by_key: &HashMap<ContentKey, Scan>,
     resolution: f64,
 ) -> ModelContent {
-    let scan = |key: &ScanKey| by_key.get(&content_key(*key));
+    // Of a scan that is no longer in the model nothing is told, even if its row is still there.
+    let scan = |key: &ScanKey| by_key.get(&content_key(*key)).filter(|_| snapshot.scans.contains_key(key));
     let in_order = |mut scans: Vec<&Scan>| -> Vec<ScanId> {
         scans.sort_by_key(|s| s.arrival);
         scans.into_iter().map(|s| s.id).collect()
@@ -41,7 +43,39 @@ pub(super) fn content_of(
         resolution,
         components,
         scans: scans.into_iter().map(|(s, standing)| (s.id, standing)).collect(),
-        edges: Vec::new(),
+        open_joins: snapshot.open_joins.iter().filter_map(|open| open_join(open, &scan)).collect(),
+        undone: snapshot.undone.iter().map(|undone| undone_of(undone, &scan)).collect(),
+        ..ModelContent::default()
+    }
+}
+
+fn open_join<'a>(open: &mapping::OpenJoin, scan: &impl Fn(&ScanKey) -> Option<&'a Scan>) -> Option<OpenJoin> {
+    let pose = |pose: &mapping::RivalPose| RivalPose {
+        a_from_b: pose.a_from_b,
+        support: pose.support,
+        edges: pose.edges,
+        violation: pose.violation,
+        inliers: pose.inliers,
+    };
+    Some(OpenJoin {
+        scan_a: scan(&open.a)?.id,
+        scan_b: scan(&open.b)?.id,
+        scans_a: open.scans_a,
+        scans_b: open.scans_b,
+        reason: reason_of_refusal(&open.refusal),
+        poses: open.poses.iter().map(pose).collect(),
+    })
+}
+
+fn undone_of<'a>(undone: &mapping::Undone, scan: &impl Fn(&ScanKey) -> Option<&'a Scan>) -> Undone {
+    let ids = |keys: &[ScanKey]| keys.iter().filter_map(scan).map(|s| s.id).collect();
+    Undone {
+        scans: ids(&undone.scans),
+        evidence: ids(&undone.evidence),
+        angle: undone.angle,
+        distance: undone.distance,
+        support_before: undone.support_before,
+        support_elsewhere: undone.support_elsewhere,
     }
 }
 
@@ -88,31 +122,5 @@ fn standing(outcome: &ScanOutcome) -> Standing {
             landmark_rms: r.landmark_rms,
         }),
         ScanOutcome::Waiting(reason) => Standing::Waiting(reason_of(reason)),
-    }
-}
-
-/// The engine's reason as a word and numbers. Its own serialisation is the word, or the word with the numbers.
-fn reason_of(reason: &WaitingReason) -> Reason {
-    let unknown = Reason { reason: "unknown".to_owned(), numbers: serde_json::Map::new() };
-    match serde_json::to_value(reason) {
-        Ok(Value::String(reason)) => Reason { reason, numbers: serde_json::Map::new() },
-        Ok(Value::Object(object)) => match object.into_iter().next() {
-            Some((reason, Value::Object(numbers))) => Reason { reason, numbers },
-            _ => unknown,
-        },
-        _ => unknown,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_reason_keeps_its_word_and_its_numbers() {
-        let reason = reason_of(&WaitingReason::Ambiguous { best_support: 3.0, rival_support: 2.5 });
-        assert_eq!(reason.reason, "ambiguous");
-        assert_eq!(reason.numbers.get("rival_support"), Some(&Value::from(2.5)));
-        assert_eq!(reason_of(&WaitingReason::OnlyScan).reason, "only-scan");
     }
 }

@@ -6,6 +6,7 @@
 
 mod compute;
 mod content;
+mod decide;
 mod error;
 mod exports;
 mod ingest;
@@ -17,6 +18,7 @@ mod parameters;
 mod picture;
 mod prepared;
 mod progress;
+mod reason;
 mod refine;
 mod register;
 mod remove;
@@ -29,4 +31,5 @@ pub use error::JobError;
 pub use exports::{CloudRequest, ComponentChoice, ExportError, Exports};
 pub use intake::{Intake, IntakeError, UploadRequest};
 pub use parameters::DECIDING_SCANS;
+pub use reason::{reason_of, reason_of_refusal};
 pub use workers::{WorkerOptions, Workers};

@@ -3,11 +3,11 @@
 use crate::cloud::ScanKey;
 use crate::control::Seed;
 use crate::features::{PrepareOptions, choose_resolution};
-use crate::mapping::MappingOptions;
+use crate::mapping::{Decision, Decisions, MappingOptions};
 use crate::project::{ContentKey, Project};
 use crate::storage::{StorageError, Store};
 
-/// Names the form and meaning of prepared scans and pair results. Another one makes the cached ones of old programs
+/// Names the form and meaning of prepared scans, pair results and snapshots. Another one makes the cached ones of old programs
 /// unreachable, so it changes whenever the engine's numbers do.
 const ENGINE: &str = "engine/3";
 
@@ -48,9 +48,9 @@ impl Parameters {
         PrepareOptions::at(self.resolution, self.seed)
     }
 
-    /// As the engine takes them for mapping.
-    pub fn mapping_options(&self) -> MappingOptions {
-        MappingOptions { seed: self.seed, ..MappingOptions::default() }
+    /// As the engine takes them for mapping, together with what clients decided.
+    pub fn mapping_options(&self, decisions: &[Decision]) -> MappingOptions {
+        MappingOptions { seed: self.seed, decisions: Decisions::new(decisions), ..MappingOptions::default() }
     }
 }
 

@@ -25,6 +25,7 @@ pub(super) async fn register(task: &Task) -> Result<(), JobError> {
         );
         session.remake(task, parameters, scans).await?;
     } else {
+        session.obey(task).await?;
         session.extend(task, scans).await?;
     }
     let unfit: HashMap<ScanId, Fault> = session.unfit.iter().cloned().collect();

@@ -14,6 +14,7 @@ pub(super) async fn remove(task: &Task) -> Result<(), JobError> {
         return Err(JobError::Lost);
     };
     let was_there = session.remove(scan.key);
+    session.obey(task).await?;
     session
         .publish(task, |_, version, _| {
             Ok(json!({ "status": if was_there { "removed" } else { "unchanged" }, "version": version }))

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde_json::Value;
 
 use super::content::{content_of, edges_of};
+use super::decide::engine_decisions;
 use super::model_cache::ModelCache;
 use super::parameters::{Parameters, content_key, scan_key};
 use super::prepared::prepare_all;
@@ -14,10 +15,11 @@ use super::workers::WorkerOptions;
 use super::{Compute, JobError, Panicked};
 use crate::control::{CancelToken, Control};
 use crate::features::PreparedScan;
-use crate::mapping::{LiveModel, ModelSnapshot};
+use crate::mapping::{Decision, LiveModel, MappingOptions, ModelSnapshot};
 use crate::pairwise::PairResult;
 use crate::project::{
-    ContentKey, Fault, JobId, ModelContent, Project, ProjectId, Scan, ScanId, Standing, VersionNumber,
+    ContentKey, Fault, JobId, KeptDecision, ModelContent, Project, ProjectId, Scan, ScanId, Standing,
+    VersionNumber,
 };
 use crate::storage::{BlobId, Claim, NewVersion, Publication, ScanChange, Store};
 
@@ -54,6 +56,10 @@ pub(super) struct Session {
     pub before: ModelContent,
     /// Hash of that version's snapshot.
     snapshot_before: Option<BlobId>,
+    /// What clients had decided when the job opened the model …
+    kept: Vec<KeptDecision>,
+    /// … and the same in the engine's terms.
+    decisions: Vec<Decision>,
     /// Scans that cannot take part after all, found on the way.
     pub unfit: Vec<(ScanId, Fault)>,
 }
@@ -62,29 +68,32 @@ impl Session {
     /// Opens the newest version of a project's model.
     pub async fn open(task: &Task, project: ProjectId) -> Result<Self, JobError> {
         let project = task.store.project(project).await?;
-        let chosen = Parameters::choose(&task.store, &project).await?;
-        if project.head == VersionNumber::EMPTY {
-            return Ok(Self {
-                model: LiveModel::new(chosen.mapping_options()),
-                parameters: chosen,
-                project,
-                before: ModelContent::default(),
-                snapshot_before: None,
-                unfit: Vec::new(),
-            });
-        }
-        let (version, engine) = task.store.version(project.id, project.head).await?;
-        let parameters = Parameters { resolution: version.resolution, seed: project.settings.seed };
-        let snapshot = BlobId::parse(&version.snapshot)?;
-        let (_, before) = task.store.content(project.id, Some(project.head)).await?;
+        let parameters = Parameters::choose(&task.store, &project).await?;
+        let kept = task.store.all_decisions(project.id).await?;
+        let decisions = if kept.is_empty() {
+            Vec::new()
+        } else {
+            engine_decisions(&kept, &scans_by_key(task, project.id).await?)
+        };
         let mut session = Self {
-            model: LiveModel::new(parameters.mapping_options()),
+            model: LiveModel::new(parameters.mapping_options(&decisions)),
             parameters,
             project,
-            before,
-            snapshot_before: Some(snapshot),
+            before: ModelContent::default(),
+            snapshot_before: None,
+            kept,
+            decisions,
             unfit: Vec::new(),
         };
+        if session.project.head == VersionNumber::EMPTY {
+            return Ok(session);
+        }
+        let (version, engine) = task.store.version(session.project.id, session.project.head).await?;
+        let parameters = Parameters { resolution: version.resolution, seed: session.project.settings.seed };
+        let snapshot = BlobId::parse(&version.snapshot)?;
+        session.parameters = parameters;
+        session.snapshot_before = Some(snapshot);
+        (_, session.before) = task.store.content(session.project.id, Some(session.project.head)).await?;
         if engine != parameters.engine() {
             // Another engine made this model: what it stored means nothing to this one.
             session.remake(task, parameters, Vec::new()).await?;
@@ -102,13 +111,13 @@ impl Session {
         let bytes = task.compute(move |_| blobs.get(snapshot)).await??;
         let snapshot =
             ModelSnapshot::from_bytes(&bytes).map_err(|e| JobError::for_good("damaged-data", e))?;
-        let by_key = self.scans_by_key(task).await?;
+        let by_key = scans_by_key(task, self.project.id).await?;
         let known: Vec<Scan> =
             snapshot.scans.keys().filter_map(|key| by_key.get(&content_key(*key)).cloned()).collect();
         let scans = prepare_all(task, &known, self.parameters).await?;
         let scans: Vec<Arc<PreparedScan>> = scans.into_iter().collect::<Result<_, JobError>>()?;
         let rows = task.store.pairs(self.project.id, &self.parameters.engine()).await?;
-        let options = self.parameters.mapping_options();
+        let options = self.options();
         self.model = task
             .compute(move |_| -> Result<LiveModel, JobError> {
                 let known = |key| snapshot.scans.contains_key(&key);
@@ -134,13 +143,13 @@ impl Session {
         parameters: Parameters,
         more: Vec<Scan>,
     ) -> Result<(), JobError> {
-        let by_key = self.scans_by_key(task).await?;
+        let by_key = scans_by_key(task, self.project.id).await?;
         let known: HashMap<ScanId, &Scan> = by_key.values().map(|s| (s.id, s)).collect();
         let old = self.before.scans.iter().filter(|(_, s)| !matches!(s, Standing::Failed(_)));
         let mut all: Vec<Scan> = old.filter_map(|(id, _)| known.get(id).map(|s| (*s).clone())).collect();
         all.extend(more);
         self.parameters = parameters;
-        self.model = LiveModel::new(parameters.mapping_options());
+        self.model = LiveModel::new(self.options());
         self.extend(task, all).await
     }
 
@@ -165,7 +174,7 @@ impl Session {
         task: &Task,
         change: impl FnOnce(&mut LiveModel, Control<'_>) -> T + Send + 'static,
     ) -> Result<T, JobError> {
-        let empty = LiveModel::new(self.parameters.mapping_options());
+        let empty = LiveModel::new(self.options());
         let mut model = std::mem::replace(&mut self.model, empty);
         let (model, result) = task
             .compute(move |control| {
@@ -184,11 +193,12 @@ impl Session {
         task: &Task,
         outcome: impl Fn(&ModelContent, VersionNumber, JobId) -> Result<Value, Fault>,
     ) -> Result<(), JobError> {
-        let by_key = self.scans_by_key(task).await?;
+        let by_key = scans_by_key(task, self.project.id).await?;
         let blobs = task.store.blobs.clone();
         let (parameters, old) = (self.parameters, self.snapshot_before);
+        let decisions = self.kept.iter().map(|kept| (kept.id, kept.decision)).collect();
         let (model, written, pairs) = {
-            let empty = LiveModel::new(parameters.mapping_options());
+            let empty = LiveModel::new(self.options());
             let mut model = std::mem::replace(&mut self.model, empty);
             task.compute(move |_| -> Result<_, JobError> {
                 let pairs = stored_pairs(model.take_new_pairs())?;
@@ -197,6 +207,7 @@ impl Session {
                 let stored = blobs.put(&bytes)?;
                 let mut content = content_of(&snapshot, &by_key, parameters.resolution);
                 content.edges = edges_of(model.graph(), &content, &by_key);
+                content.decisions = decisions;
                 let nothing = old.is_none() && content.scans.is_empty();
                 if nothing || old == Some(stored.id) {
                     return Ok((model, None, pairs));
@@ -228,21 +239,33 @@ impl Session {
         Ok(())
     }
 
-    /// The project's scans by what the engine calls them. Of two with the same content, one was deleted.
-    async fn scans_by_key(&self, task: &Task) -> Result<HashMap<ContentKey, Scan>, JobError> {
-        let mut by_key = HashMap::new();
-        for (scan, deleted) in task.store.scans_ever(self.project.id).await? {
-            if !deleted || !by_key.contains_key(&scan.key) {
-                by_key.insert(scan.key, scan);
-            }
-        }
-        Ok(by_key)
+    /// Makes the model obey what clients have decided. Nothing happens if it does already.
+    pub async fn obey(&mut self, task: &Task) -> Result<(), JobError> {
+        let decisions = self.decisions.clone();
+        self.change(task, move |model, control| model.decide(&decisions, control)).await??;
+        Ok(())
+    }
+
+    /// What the engine is asked to do in this project.
+    fn options(&self) -> MappingOptions {
+        self.parameters.mapping_options(&self.decisions)
     }
 
     /// Takes a scan out of the model. Returns whether it was there.
     pub fn remove(&mut self, scan: ContentKey) -> bool {
         self.model.remove(scan_key(scan))
     }
+}
+
+/// A project's scans by what the engine calls them. Of two with the same content, one was deleted.
+async fn scans_by_key(task: &Task, project: ProjectId) -> Result<HashMap<ContentKey, Scan>, JobError> {
+    let mut by_key = HashMap::new();
+    for (scan, deleted) in task.store.scans_ever(project).await? {
+        if !deleted || !by_key.contains_key(&scan.key) {
+            by_key.insert(scan.key, scan);
+        }
+    }
+    Ok(by_key)
 }
 
 fn new_version(snapshot: BlobId, readable: BlobId, content: &ModelContent) -> NewVersion {

@@ -8,6 +8,7 @@ use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
+use super::decide::decide;
 use super::ingest::ingest;
 use super::model_cache::ModelCache;
 use super::progress::ProgressSink;
@@ -235,6 +236,7 @@ async fn run(lane: Lane, task: &Task) -> Result<(), JobError> {
         (Lane::Ingest, _) => ingest(task).await,
         (Lane::Map, JobKind::Registration) => register(task).await,
         (Lane::Map, JobKind::Removal) => remove(task).await,
+        (Lane::Map, JobKind::Decision) => decide(task).await,
         (Lane::Map, _) => refine(task).await,
     }
 }

@@ -1,4 +1,4 @@
-//! The first pair of a component: the best edge of the most central scan that has a good one.
+//! The first pair of a component: one that a client joined, or the best edge of the most central scan that has a good one.
 
 use std::collections::BTreeSet;
 
@@ -12,7 +12,8 @@ use crate::graph::{Edge, ScanGraph, harmonic_centrality, softplus};
 /// most 1/3.
 const LEAST_NORMAL_SPREAD: f64 = 0.01;
 
-/// Pairs of free scans that could start a component at this level, the best first: central scans first, then matches.
+/// Pairs of free scans that could start a component at this level, the best first: what a client joined, with or without an edge, then
+/// central scans, then matches.
 #[must_use]
 pub fn initial_pairs(
     graph: &ScanGraph,
@@ -35,13 +36,12 @@ pub fn initial_pairs(
         .map(|e| (of(&e.pair.a).max(of(&e.pair.b)), f64::from(inliers(e)), e))
         .collect();
     ranked.sort_by(|x, y| y.0.total_cmp(&x.0).then(y.1.total_cmp(&x.1)).then(x.2.pair.cmp(&y.2.pair)));
-    ranked
-        .into_iter()
-        .map(|(_, _, e)| {
-            // The more central scan comes first: it becomes the gauge.
-            if of(&e.pair.b) > of(&e.pair.a) { (e.pair.b, e.pair.a) } else { (e.pair.a, e.pair.b) }
-        })
-        .collect()
+    let found = ranked.into_iter().map(|(_, _, e)| {
+        // The more central scan comes first: it becomes the gauge.
+        if of(&e.pair.b) > of(&e.pair.a) { (e.pair.b, e.pair.a) } else { (e.pair.a, e.pair.b) }
+    });
+    let decided = options.decisions.joined_pairs().filter(|p| free.contains(&p.a) && free.contains(&p.b));
+    decided.map(|p| (p.a, p.b)).chain(found).collect()
 }
 
 /// Evidence of the best hypothesis with the rival's share taken off.

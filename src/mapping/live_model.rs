@@ -114,15 +114,15 @@ impl LiveModel {
     /// Obeys these decisions from now on, instead of any earlier ones: the components that they concern are decided anew. On `Err`
     /// the model is unchanged.
     pub fn decide(&mut self, decisions: &[Decision], control: Control<'_>) -> Result<(), Cancelled> {
-        let mut next = self.clone();
-        next.options.decisions = Decisions::new(decisions);
-        let old = self.options.decisions.as_slice();
-        let new = next.options.decisions.as_slice();
+        let decisions = Decisions::new(decisions);
+        let (old, new) = (self.options.decisions.as_slice(), decisions.as_slice());
         let changed = old.iter().filter(|d| !new.contains(d)).chain(new.iter().filter(|d| !old.contains(d)));
         let concerned: BTreeSet<ScanKey> = changed.flat_map(|d| [d.pair.a, d.pair.b]).collect();
         if concerned.is_empty() {
             return Ok(());
         }
+        let mut next = self.clone();
+        next.options.decisions = decisions;
         next.mapper.reopen(&concerned);
         next.mapper.loosen(&next.graph, next.options.firm_support, &next.options);
         next.grow(control)?;

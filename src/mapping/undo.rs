@@ -13,12 +13,18 @@ use crate::cloud::ScanKey;
 use crate::graph::ScanGraph;
 
 impl Mapper {
-    /// Takes apart every component that its own pairs condemn. Its scans wait, and no step joins them again before
+    /// Takes apart every component that its own pairs condemn, unless a client's join holds in it: then the client has told alike places
+    /// apart, and pairs cannot. Its scans wait, and no step joins them again before
     /// [`Mapper::loosen`] decides all anew. Returns how many components were taken apart.
     pub fn undo_contradicted(&mut self, graph: &ScanGraph, options: &MappingOptions) -> usize {
         let mut kept = Vec::new();
         let mut undone = 0;
         for component in std::mem::take(&mut self.components) {
+            let placed = |scan| component.poses.contains_key(&scan);
+            if options.decisions.joined_pairs().any(|pair| placed(pair.a) && placed(pair.b)) {
+                kept.push(component);
+                continue;
+            }
             let testimony = testimony(graph, &component, options);
             let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) else {
                 kept.push(component);

@@ -60,6 +60,10 @@ id! {
     /// Names a job.
     JobId
 }
+id! {
+    /// Names a decision about two scans.
+    DecisionId
+}
 
 /// Counts the versions of a project's model: 1 is the first, and 0 the empty model before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default, Serialize, Deserialize)]

@@ -24,6 +24,8 @@ pub enum JobKind {
     Rebuild,
     /// Takes a deleted scan out of the model.
     Removal,
+    /// Makes the model obey what clients have decided.
+    Decision,
 }
 
 /// The text names no kind of job.
@@ -33,13 +35,14 @@ pub struct BadJobKind(pub String);
 
 impl JobKind {
     /// Every kind.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::Registration,
         Self::GlobalBundleAdjustment,
         Self::TrackRefinement,
         Self::DenseRefinement,
         Self::Rebuild,
         Self::Removal,
+        Self::Decision,
     ];
 
     /// The word that is stored and shown.
@@ -52,13 +55,14 @@ impl JobKind {
             Self::DenseRefinement => "dense-refinement",
             Self::Rebuild => "rebuild",
             Self::Removal => "removal",
+            Self::Decision => "decision",
         }
     }
 
-    /// Whether a client may ask for it; the others come with an upload or a deletion.
+    /// Whether a client may ask for it; the others come with an upload, a deletion or a decision.
     #[must_use]
     pub fn on_request(self) -> bool {
-        !matches!(self, Self::Registration | Self::Removal)
+        !matches!(self, Self::Registration | Self::Removal | Self::Decision)
     }
 }
 

@@ -2,18 +2,22 @@
 //!
 //! Uses [`crate::geometry`]; `storage` keeps these types, `jobs` works on them and `http` shows them.
 
+mod decision;
 mod id;
 mod job;
 mod model;
 mod name;
+mod open_join;
 mod scan;
 mod settings;
 mod time;
 
-pub use id::{BadId, JobId, ProjectId, ScanId, VersionNumber};
+pub use decision::{BadMotion, Decision, KeptDecision, Verdict, motion};
+pub use id::{BadId, DecisionId, JobId, ProjectId, ScanId, VersionNumber};
 pub use job::{BadJobKind, Fault, Job, JobKind, JobState, Lane};
 pub use model::{Component, Edge, ModelContent, Placement, Reason, Standing, Version};
 pub use name::{BadName, Name};
+pub use open_join::{OpenJoin, RivalPose, Undone};
 pub use scan::{BadInterpretation, ContentKey, Interpretation, Scan, ScanState};
 pub use settings::{BadSettings, Project, ProjectSettings};
 pub use time::Timestamp;

@@ -3,7 +3,10 @@
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::{Fault, JobId, JobKind, ProjectId, ScanId, Timestamp, VersionNumber};
+use super::{
+    Decision, DecisionId, Fault, JobId, JobKind, OpenJoin, ProjectId, ScanId, Timestamp, Undone,
+    VersionNumber,
+};
 use crate::geometry::Pose;
 
 /// Where a scan stands in the model.
@@ -84,6 +87,15 @@ pub struct ModelContent {
     pub scans: Vec<(ScanId, Standing)>,
     /// Verified edges between scans of the model.
     pub edges: Vec<Edge>,
+    /// Joins that were not made although something speaks for them, the best supported first. Programs before 0.1 wrote none.
+    #[serde(default)]
+    pub open_joins: Vec<OpenJoin>,
+    /// Placements that later scans contradicted, and that this version took back.
+    #[serde(default)]
+    pub undone: Vec<Undone>,
+    /// What clients had decided, and this version obeys, in the order it was decided.
+    #[serde(default)]
+    pub decisions: Vec<(DecisionId, Decision)>,
 }
 
 impl ModelContent {

@@ -1,6 +1,6 @@
 //! What can go wrong below the service.
 
-use crate::project::{JobId, ProjectId, ScanId, VersionNumber};
+use crate::project::{DecisionId, JobId, ProjectId, ScanId, VersionNumber};
 
 /// A failure of the database or of the blob files.
 #[derive(Debug, thiserror::Error)]
@@ -14,6 +14,19 @@ pub enum StorageError {
     /// No such job.
     #[error("there is no job {0}")]
     NoJob(JobId),
+    /// No such decision in the project, or it was taken back, or went with a scan.
+    #[error("there is no decision {0}")]
+    NoDecision(DecisionId),
+    /// The project holds as many decisions as it may.
+    #[error(
+        "project {project} holds {limit} decisions, which is the limit; take back what no longer matters"
+    )]
+    TooManyDecisions {
+        /// The project.
+        project: ProjectId,
+        /// How many it may hold.
+        limit: u32,
+    },
     /// The project has no version of this number.
     #[error("project {0} has no version {1}")]
     NoVersion(ProjectId, VersionNumber),

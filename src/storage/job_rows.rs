@@ -65,14 +65,14 @@ impl Store {
         rows.iter().map(|row| Ok((row.try_get("seq")?, job(row)?))).collect()
     }
 
-    /// Dismisses a job that has not ended. Its worker, if any, finds that it no longer holds it. A scan whose
+    /// Dismisses a job that has not ended; what was deleted or decided stays so, and the model has to follow. Its worker, if any, finds that it no longer holds it. A scan whose
     /// registration is dismissed stays, unregistered.
     pub async fn dismiss_job(&self, id: JobId) -> Result<Job, StorageError> {
         let now = Timestamp::now();
         let mut tx = self.begin().await?;
         let done = sqlx::query(
             "UPDATE jobs SET state = 'dismissed', worker = NULL, leader = NULL, finished_ms = ?1, updated_ms = ?1,
-               revision = revision + 1 WHERE id = ?2 AND state IN ('accepted', 'running') AND kind <> 'removal'",
+               revision = revision + 1 WHERE id = ?2 AND state IN ('accepted', 'running') AND kind NOT IN ('removal', 'decision')",
         )
         .bind(now.0)
         .bind(id.to_string())

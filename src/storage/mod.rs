@@ -6,6 +6,7 @@
 
 mod blobs;
 mod claims;
+mod decisions;
 mod derived;
 mod error;
 mod garbage;

@@ -1,6 +1,7 @@
 //! The REST interface, tried from outside: a real server on a real database, over real HTTP.
 
 mod bad_files;
+mod decisions;
 mod description;
 mod downloads;
 mod jobs;

@@ -7,6 +7,8 @@ use cairn::app::{Running, start};
 use cairn::config::Settings;
 use reqwest::{Client, Response, StatusCode};
 use serde_json::{Value, json};
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{Connection as _, SqliteConnection};
 use tempfile::TempDir;
 
 /// A running service with its own data directory.
@@ -41,6 +43,16 @@ impl Server {
     /// Stops softly and starts again on the same data.
     pub async fn restart(self) -> Self {
         self.running.stop().await;
+        Self::on(self.data, Settings::default()).await
+    }
+
+    /// Stops, makes every version look as if another engine had made it, and starts again.
+    pub async fn restart_with_a_model_of_another_engine(self) -> Self {
+        self.running.stop().await;
+        let options = SqliteConnectOptions::new().filename(self.data.path().join("cairn.sqlite"));
+        let mut database = SqliteConnection::connect_with(&options).await.unwrap();
+        sqlx::query("UPDATE versions SET engine = 'engine/0'").execute(&mut database).await.unwrap();
+        database.close().await.unwrap();
         Self::on(self.data, Settings::default()).await
     }
 

@@ -4,7 +4,9 @@
 //! a pose. Files are decoded three times (to measure, to prepare, to merge) rather than kept: memory holds the prepared
 //! scans and as many raw clouds as there are threads.
 
+mod decisions;
 pub(super) mod inputs;
+mod open_joins;
 mod output;
 pub(super) mod pipeline;
 mod poses;
@@ -61,6 +63,10 @@ pub struct RegisterArgs {
     /// Unit of the coordinates: mm, cm, m, km, in, ft, us-ft, or metres in one unit
     #[arg(long, value_name = "UNIT", default_value = "m", value_parser = unit)]
     pub units: f64,
+    /// What you decided about pairs that the data cannot tell apart: a JSON list of {"verdict": "join" or "forbid", "scan_a": NAME,
+    /// "scan_b": NAME, "a_from_b": 4x4 matrix}; report.json lists what is open, with such matrices
+    #[arg(long, value_name = "FILE")]
+    pub decisions: Option<PathBuf>,
     /// Print the report as JSON
     #[arg(long)]
     pub json: bool,
@@ -85,6 +91,10 @@ pub fn run(args: &RegisterArgs) -> anyhow::Result<ExitCode> {
     let interpretation = Interpretation { metres_per_unit: args.units, sensor_position: None };
     interpretation.validate()?;
     let inputs = inputs::gather(&args.scans, Some(&args.out))?;
+    let decisions = match &args.decisions {
+        Some(path) => decisions::read(path, &inputs)?,
+        None => Vec::new(),
+    };
     let mut staging = Staging::begin(&args.out, args.force)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads).build()?;
 
@@ -92,7 +102,7 @@ pub fn run(args: &RegisterArgs) -> anyhow::Result<ExitCode> {
     let watch = Watch::new(args.quiet);
     let control = Control { cancel: &cancel, observer: &watch };
     let result = pool.install(|| -> anyhow::Result<Report> {
-        let registration = Registration::compute(&inputs, settings, interpretation, control)?;
+        let registration = Registration::compute(&inputs, settings, interpretation, &decisions, control)?;
         output::write(&registration, &mut staging, control)?;
         let report = Report::new(&registration, &inputs, &watch, pool.current_num_threads(), started);
         staging.write("report.json", &serde_json::to_vec_pretty(&report)?)?;

@@ -7,12 +7,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
+use super::decisions::{NamedDecision, by_key};
 use super::inputs::{Input, Inputs};
 use super::source::{Failure, Refusal, Source};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control, Stage};
 use crate::features::{PrepareOptions, PreparedScan, choose_resolution, natural_resolution, prepare};
-use crate::mapping::{LiveModel, MappingOptions, ModelSnapshot};
+use crate::mapping::{Decisions, LiveModel, MappingOptions, ModelSnapshot};
 use crate::project::{Interpretation, ProjectSettings};
 
 /// A scan, in however many files its content is.
@@ -54,6 +55,7 @@ impl Registration {
         inputs: &Inputs,
         settings: ProjectSettings,
         interpretation: Interpretation,
+        decisions: &[NamedDecision],
         control: Control<'_>,
     ) -> Result<Self, Cancelled> {
         let (scans, unreadable) = measure(&inputs.files, &interpretation, control)?;
@@ -61,7 +63,11 @@ impl Registration {
         let resolution = settings.resolution.unwrap_or_else(|| choose_resolution(&natural));
         let options = PrepareOptions::at(resolution, settings.seed);
         let (prepared, unfit) = prepare_all(&scans, &interpretation, &options, control)?;
-        let mut model = LiveModel::new(MappingOptions { seed: settings.seed, ..MappingOptions::default() });
+        let mut model = LiveModel::new(MappingOptions {
+            seed: settings.seed,
+            decisions: Decisions::new(&by_key(decisions, &scans)),
+            ..MappingOptions::default()
+        });
         model.register(prepared, control)?;
         let snapshot = model.snapshot();
         Ok(Self { settings, interpretation, resolution, scans, unfit, unreadable, model, snapshot })

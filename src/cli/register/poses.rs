@@ -7,7 +7,9 @@ use serde_json::{Map, Value};
 
 use super::pipeline::Registration;
 use super::source::Failure;
+use crate::jobs::reason_of;
 use crate::mapping::{ScanOutcome, WaitingReason};
+use crate::project::Reason;
 
 /// `poses.json`. Equal scans and settings give equal values, bit for bit.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -91,16 +93,29 @@ impl PoseEntry {
 
     /// Why it is not registered, for people.
     pub fn because(&self) -> String {
-        let text = |value: &Value| value.as_str().map_or_else(|| short(value), str::to_owned);
-        let others = self.why.iter().filter(|(name, _)| *name != "reason" && *name != "detail");
-        let numbers: Vec<String> =
-            others.map(|(name, v)| format!("{} {}", name.replace('_', " "), text(v))).collect();
-        match (self.why.get("detail"), self.why.get("reason")) {
-            (Some(detail), _) => text(detail),
-            (None, Some(reason)) if numbers.is_empty() => text(reason),
-            (None, Some(reason)) => format!("{} ({})", text(reason), numbers.join(", ")),
-            (None, None) => String::new(),
-        }
+        told(&self.why)
+    }
+}
+
+/// A reason with its numbers, or the detail that a failure has, for people.
+pub(super) fn told(why: &Map<String, Value>) -> String {
+    let text = |value: &Value| value.as_str().map_or_else(|| short(value), str::to_owned);
+    let number = |name: &str| why.get(name).map_or_else(String::new, short);
+    if why.get("reason").is_some_and(|word| word == "contradicted") {
+        return format!(
+            "contradicted ({} pairs are sure of another pose, {} were of this one; alike places were taken for one)",
+            number("against"),
+            number("agreeing")
+        );
+    }
+    let others = why.iter().filter(|(name, _)| *name != "reason" && *name != "detail");
+    let numbers: Vec<String> =
+        others.map(|(name, v)| format!("{} {}", name.replace('_', " "), text(v))).collect();
+    match (why.get("detail"), why.get("reason")) {
+        (Some(detail), _) => text(detail),
+        (None, Some(reason)) if numbers.is_empty() => text(reason),
+        (None, Some(reason)) => format!("{} ({})", text(reason), numbers.join(", ")),
+        (None, None) => String::new(),
     }
 }
 
@@ -112,17 +127,10 @@ fn short(value: &Value) -> String {
     }
 }
 
-/// The engine's reason as a word and numbers. Its own serialisation is the word, or the word with the numbers.
+/// The engine's reason as fields: the word under `reason`, the numbers by their names.
 fn fields(reason: &WaitingReason) -> Map<String, Value> {
-    let (word, mut fields) = match serde_json::to_value(reason) {
-        Ok(Value::Object(object)) => match object.into_iter().next() {
-            Some((word, Value::Object(numbers))) => (Value::String(word), numbers),
-            _ => (Value::Null, Map::new()),
-        },
-        Ok(word) => (word, Map::new()),
-        Err(_) => (Value::Null, Map::new()),
-    };
-    fields.insert("reason".to_owned(), word);
+    let Reason { reason, numbers: mut fields } = reason_of(reason);
+    fields.insert("reason".to_owned(), reason.into());
     fields
 }
 
@@ -142,5 +150,12 @@ mod tests {
         assert_eq!(json["tried"], 7);
         let text = entry.because();
         assert!(text.starts_with("no-verified-pair (") && text.contains("best support 0.512"), "{text}");
+    }
+
+    #[test]
+    fn a_contradicted_scan_is_told_in_words() {
+        let reason = WaitingReason::Contradicted { against: 5, agreeing: 3 };
+        let text = PoseEntry::of(&ScanOutcome::Waiting(reason)).because();
+        assert!(text.contains("5 pairs are sure of another pose, 3 were of this one"), "{text}");
     }
 }

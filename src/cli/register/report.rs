@@ -7,11 +7,15 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::inputs::Inputs;
+use super::open_joins::{OpenJoinReport, UndoneReport, open_joins, undone};
 use super::pipeline::Registration;
 use super::poses::{PoseEntry, Poses, Status};
 use crate::cli::progress::{Moment, Seconds, Watch};
 use crate::control::Stage;
 use crate::mapping::ScanOutcome;
+
+/// Open joins that the summary tells one by one, at most.
+const OPEN_JOINS_TOLD: usize = 5;
 
 /// The report of a run.
 #[derive(Debug, Serialize)]
@@ -30,6 +34,10 @@ pub(super) struct Report {
     /// By file name.
     scans: BTreeMap<String, ScanReport>,
     pairs: Pairs,
+    /// Joins that were not made although something speaks for them, the best supported first.
+    open_joins: Vec<OpenJoinReport>,
+    /// Placements that further scans contradicted, and that were taken back.
+    undone: Vec<UndoneReport>,
     /// Files of folders that hold no scan.
     ignored: Vec<String>,
     seconds: Times,
@@ -135,6 +143,8 @@ impl Report {
             components: components(registration),
             scans: scans(registration, poses),
             pairs,
+            open_joins: open_joins(registration),
+            undone: undone(registration),
             ignored: inputs.ignored.clone(),
             seconds: Times { total: started.until(&Moment::now()), stages: watch.stages() },
         }
@@ -160,6 +170,19 @@ impl Report {
                 Status::Failed => "failed",
             };
             let _ = writeln!(text, "{name} {status}: {}", scan.outcome.because());
+        }
+        for undone in &self.undone {
+            let _ = writeln!(text, "{}", undone.line());
+        }
+        for open in self.open_joins.iter().take(OPEN_JOINS_TOLD) {
+            let _ = writeln!(text, "{}", open.line());
+        }
+        if self.open_joins.len() > OPEN_JOINS_TOLD {
+            let _ = writeln!(
+                text,
+                "{} more open joins are in report.json",
+                self.open_joins.len() - OPEN_JOINS_TOLD
+            );
         }
         let Counts { files, registered, waiting, failed, duplicates } = self.counts;
         let _ = write!(text, "{registered} of {files} scans registered");

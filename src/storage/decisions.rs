@@ -1,0 +1,249 @@
+//! Rows of decisions. Every change brings the job that makes the model obey, in the same transaction.
+
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, Sqlite, Transaction};
+
+use super::job_rows::insert_job;
+use super::rows::{json, parsed, to_json};
+use super::{Page, StorageError, Store};
+use crate::project::{
+    Decision, DecisionId, Job, JobId, JobKind, KeptDecision, Lane, ProjectId, ScanId, Timestamp,
+};
+
+impl Store {
+    /// Keeps a decision. It replaces earlier ones about the two scans that it contradicts or repeats: a join every other one, a ban
+    /// every join. Returns it with the job that makes the model obey.
+    pub async fn decide(
+        &self,
+        project: ProjectId,
+        decision: &Decision,
+    ) -> Result<(KeptDecision, Job), StorageError> {
+        let kept =
+            KeptDecision { id: DecisionId::generate(), decision: *decision, created: Timestamp::now() };
+        let Decision { scan_a, scan_b, verdict } = decision;
+        let mut tx = self.begin().await?;
+        for scan in [scan_a, scan_b] {
+            present(&mut tx, project, *scan).await?;
+        }
+        let verdict = to_json(verdict)?;
+        sqlx::query(
+            "DELETE FROM decisions WHERE project_id = ?1
+               AND ((scan_a = ?2 AND scan_b = ?3) OR (scan_a = ?3 AND scan_b = ?2))
+               AND ('join' IN (verdict ->> 'verdict', ?4 ->> 'verdict') OR (verdict = ?4 AND scan_a = ?2))",
+        )
+        .bind(project.to_string())
+        .bind(scan_a.to_string())
+        .bind(scan_b.to_string())
+        .bind(&verdict)
+        .execute(&mut *tx)
+        .await?;
+        let row = sqlx::query("SELECT COUNT(*) AS held FROM decisions WHERE project_id = ?")
+            .bind(project.to_string())
+            .fetch_one(&mut *tx)
+            .await?;
+        if row.try_get::<i64, _>("held")? >= KeptDecision::MOST.into() {
+            return Err(StorageError::TooManyDecisions { project, limit: KeptDecision::MOST });
+        }
+        sqlx::query(
+            "INSERT INTO decisions (id, project_id, scan_a, scan_b, verdict, created_ms)
+               VALUES (?, ?, ?, ?, ?, ?)",
+        )
+        .bind(kept.id.to_string())
+        .bind(project.to_string())
+        .bind(scan_a.to_string())
+        .bind(scan_b.to_string())
+        .bind(&verdict)
+        .bind(kept.created.0)
+        .execute(&mut *tx)
+        .await?;
+        let job = self.obey(tx, project).await?;
+        Ok((kept, job))
+    }
+
+    /// Takes a decision back. Returns the job that makes the model follow.
+    pub async fn take_decision_back(&self, project: ProjectId, id: DecisionId) -> Result<Job, StorageError> {
+        let mut tx = self.begin().await?;
+        let done = sqlx::query("DELETE FROM decisions WHERE id = ? AND project_id = ?")
+            .bind(id.to_string())
+            .bind(project.to_string())
+            .execute(&mut *tx)
+            .await?;
+        if done.rows_affected() == 0 {
+            return Err(StorageError::NoDecision(id));
+        }
+        self.obey(tx, project).await
+    }
+
+    /// One decision.
+    pub async fn decision(&self, project: ProjectId, id: DecisionId) -> Result<KeptDecision, StorageError> {
+        let row = sqlx::query("SELECT * FROM decisions WHERE id = ? AND project_id = ?")
+            .bind(id.to_string())
+            .bind(project.to_string())
+            .fetch_optional(&self.read)
+            .await?;
+        row.as_ref().map(kept).transpose()?.ok_or(StorageError::NoDecision(id))
+    }
+
+    /// Decisions of a project in the order they were made, each with its position in the list.
+    pub async fn decisions(
+        &self,
+        project: ProjectId,
+        page: Page,
+    ) -> Result<Vec<(i64, KeptDecision)>, StorageError> {
+        let rows =
+            sqlx::query("SELECT * FROM decisions WHERE project_id = ? AND seq > ? ORDER BY seq LIMIT ?")
+                .bind(project.to_string())
+                .bind(page.after.unwrap_or(0))
+                .bind(page.limit)
+                .fetch_all(&self.read)
+                .await?;
+        rows.iter().map(|row| Ok((row.try_get("seq")?, kept(row)?))).collect()
+    }
+
+    /// All decisions of a project in the order they were made: what the next version of its model obeys.
+    pub async fn all_decisions(&self, project: ProjectId) -> Result<Vec<KeptDecision>, StorageError> {
+        let page = Page { after: None, limit: KeptDecision::MOST };
+        Ok(self.decisions(project, page).await?.into_iter().map(|(_, kept)| kept).collect())
+    }
+
+    /// Commits a change of decisions together with the job that makes the model obey.
+    async fn obey(
+        &self,
+        mut tx: Transaction<'static, Sqlite>,
+        project: ProjectId,
+    ) -> Result<Job, StorageError> {
+        let job = JobId::generate();
+        insert_job(&mut tx, job, project, None, JobKind::Decision, Lane::Map, Timestamp::now()).await?;
+        tx.commit().await?;
+        self.announce([job]);
+        self.ring();
+        self.job(job).await
+    }
+}
+
+/// Fails unless the project holds the scan.
+async fn present(
+    tx: &mut Transaction<'static, Sqlite>,
+    project: ProjectId,
+    scan: ScanId,
+) -> Result<(), StorageError> {
+    sqlx::query("SELECT 1 FROM scans WHERE id = ? AND project_id = ? AND deleted_ms IS NULL")
+        .bind(scan.to_string())
+        .bind(project.to_string())
+        .fetch_optional(&mut **tx)
+        .await?
+        .map(drop)
+        .ok_or(StorageError::NoScan(scan))
+}
+
+fn kept(row: &SqliteRow) -> Result<KeptDecision, StorageError> {
+    let verdict =
+        json(row, "verdict")?.ok_or(StorageError::BadRow { column: "verdict", value: "NULL".to_owned() })?;
+    Ok(KeptDecision {
+        id: parsed(row, "id")?,
+        decision: Decision { scan_a: parsed(row, "scan_a")?, scan_b: parsed(row, "scan_b")?, verdict },
+        created: Timestamp(row.try_get("created_ms")?),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose;
+    use crate::project::{ContentKey, Interpretation, JobState, Name, ProjectSettings, Verdict};
+    use crate::storage::{BlobId, NewScan};
+
+    async fn store() -> (Store, ProjectId, [ScanId; 3], tempfile::TempDir) {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).await.unwrap();
+        let name = Name::parse("test").unwrap();
+        let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
+        let mut scans = Vec::new();
+        for content in 0..3_u8 {
+            let new = NewScan {
+                project,
+                key: ContentKey(content.into()),
+                name: name.clone(),
+                format: "ply".to_owned(),
+                blob: BlobId(blake3::hash(&[content])),
+                bytes: 1,
+                interpretation: Interpretation::default(),
+            };
+            scans.push(store.admit_scan(&new).await.unwrap().scan.id);
+        }
+        (store, project, scans.try_into().unwrap(), dir)
+    }
+
+    fn verdicts(kept: &[KeptDecision]) -> Vec<Verdict> {
+        kept.iter().map(|k| k.decision.verdict).collect()
+    }
+
+    #[tokio::test]
+    async fn a_decision_replaces_what_it_contradicts_and_brings_a_job() {
+        let (store, project, [a, b, c], _dir) = store().await;
+        let there = Pose::from_translation(nalgebra::Vector3::new(1.0, 0.0, 0.0));
+        let join = Verdict::Join { a_from_b: there };
+        let ban = Verdict::Forbid { a_from_b: Some(there) };
+        let never = Verdict::Forbid { a_from_b: None };
+        let decide = async |scan_a, scan_b, verdict| {
+            store.decide(project, &Decision { scan_a, scan_b, verdict }).await.unwrap()
+        };
+        decide(a, c, join).await;
+        for (scans, verdict, held) in [
+            ((a, b), join, vec![join, join]),
+            ((b, a), never, vec![join, never]),
+            ((b, a), ban, vec![join, never, ban]),
+            ((b, a), never, vec![join, ban, never]),
+            ((a, b), join, vec![join, join]),
+        ] {
+            let (kept, job) = decide(scans.0, scans.1, verdict).await;
+            assert_eq!((job.kind, job.state), (JobKind::Decision, JobState::Accepted));
+            assert!(store.dismiss_job(job.id).await.is_err(), "what was decided stays so");
+            assert_eq!(store.decision(project, kept.id).await.unwrap(), kept);
+            assert_eq!(verdicts(&store.all_decisions(project).await.unwrap()), held);
+        }
+    }
+
+    #[tokio::test]
+    async fn decisions_go_one_by_one_or_with_their_scan() {
+        let (store, project, [a, b, c], _dir) = store().await;
+        let decide =
+            |scan_a, scan_b| Decision { scan_a, scan_b, verdict: Verdict::Forbid { a_from_b: None } };
+        let (first, _) = store.decide(project, &decide(a, b)).await.unwrap();
+        store.decide(project, &decide(b, c)).await.unwrap();
+        let (last, _) = store.decide(project, &decide(c, a)).await.unwrap();
+        store.take_decision_back(project, first.id).await.unwrap();
+        let again = store.take_decision_back(project, first.id).await;
+        assert!(matches!(again, Err(StorageError::NoDecision(id)) if id == first.id));
+        store.delete_scan(project, b).await.unwrap();
+        assert_eq!(store.all_decisions(project).await.unwrap(), [last]);
+        let gone = store.decide(project, &decide(a, b)).await;
+        assert!(matches!(gone, Err(StorageError::NoScan(id)) if id == b));
+    }
+
+    #[tokio::test]
+    async fn a_project_holds_so_many_decisions_and_no_more() {
+        let (store, project, [a, b, c], _dir) = store().await;
+        let mut tx = store.begin().await.unwrap();
+        for i in 0..KeptDecision::MOST {
+            sqlx::query("INSERT INTO decisions VALUES (NULL, ?, ?, ?, ?, ?, 0)")
+                .bind(format!("{i}"))
+                .bind(project.to_string())
+                .bind(a.to_string())
+                .bind(b.to_string())
+                .bind(r#"{"verdict":"forbid","a_from_b":null}"#)
+                .execute(&mut *tx)
+                .await
+                .unwrap();
+        }
+        tx.commit().await.unwrap();
+        let one_more = Decision { scan_a: a, scan_b: c, verdict: Verdict::Forbid { a_from_b: None } };
+        let refused = store.decide(project, &one_more).await;
+        assert!(matches!(refused, Err(StorageError::TooManyDecisions { limit: KeptDecision::MOST, .. })));
+        // A join of the two scans takes the place of all that.
+        let a_from_b = Pose::identity();
+        let join = Decision { scan_a: b, scan_b: a, verdict: Verdict::Join { a_from_b } };
+        store.decide(project, &join).await.unwrap();
+        assert_eq!(store.all_decisions(project).await.unwrap().len(), 1);
+    }
+}
