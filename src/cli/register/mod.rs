@@ -63,8 +63,8 @@ pub struct RegisterArgs {
     /// Unit of the coordinates: mm, cm, m, km, in, ft, us-ft, or metres in one unit
     #[arg(long, value_name = "UNIT", default_value = "m", value_parser = unit)]
     pub units: f64,
-    /// What you decided about pairs that the data cannot tell apart: a JSON list of {"verdict": "join" or "forbid", "scan_a": NAME,
-    /// "scan_b": NAME, "a_from_b": 4x4 matrix}; report.json lists what is open, with such matrices
+    /// What you decided about pairs of scans that the data cannot tell apart, as a JSON list (the README shows one); report.json
+    /// lists what is open, with the poses to choose from
     #[arg(long, value_name = "FILE")]
     pub decisions: Option<PathBuf>,
     /// Print the report as JSON
