@@ -18,6 +18,9 @@ const LEAST_EVIDENCE: f64 = 0.03;
 /// Proposals that are tried as the centre of a cluster, at most.
 const MAX_CENTRES: usize = 200;
 
+/// Clusters that are weighed against each other, at most.
+pub const CLUSTERS: usize = 6;
+
 /// The pose that one hypothesis of one edge implies.
 #[derive(Debug, Clone, Copy)]
 pub struct Proposal {
@@ -45,7 +48,9 @@ pub struct Candidate {
     pub a_from_b: Pose,
     /// Sum over edges of the best evidence in the cluster.
     pub support: f64,
-    /// The same of the heaviest different cluster.
+    /// The same with what each pair says alone, where that is more: what the cluster weighs as a rival.
+    pub doubt: f64,
+    /// What the heaviest different cluster weighs as a rival.
     pub rival: f64,
     /// One proposal an edge, those in the cluster.
     pub members: Vec<Proposal>,
@@ -121,32 +126,39 @@ pub fn candidates(
         members(&proposals, centre, options.cluster_angle, reach)
             .fold((0.0, 0.0), |(evidence, doubt), p| (evidence + p.evidence, doubt + p.doubt))
     };
-    let mut clusters: Vec<(f64, f64, usize)> = centres(&proposals)
+    let clusters: Vec<(f64, f64, usize)> = centres(&proposals)
         .into_iter()
         .map(|centre| {
             let (evidence, doubt) = sums(centre);
             (evidence, doubt, centre)
         })
         .collect();
-    clusters.sort_by(|x, y| y.0.total_cmp(&x.0).then(y.1.total_cmp(&x.1)).then(x.2.cmp(&y.2)));
-    let differ = |x: &Proposal, y: &Proposal| {
-        let apart = options.rival_voxels * voxel;
+    let differ = |x: usize, y: usize| {
+        let (x, y, apart) = (&proposals[x], &proposals[y], options.rival_voxels * voxel);
         !within(x, y, options.rival_angle, apart) || !within(y, x, options.rival_angle, apart)
     };
-    let mut kept: Vec<(f64, usize)> = Vec::new();
-    for (support, _, centre) in &clusters {
-        if kept.len() < most && kept.iter().all(|(_, k)| differ(&proposals[*k], &proposals[*centre])) {
-            kept.push((*support, *centre));
+    let mut kept: Vec<(f64, f64, usize)> = Vec::new();
+    // First the best supported, then those that are most to be feared.
+    for (room, weight) in [(most.div_ceil(2), 0), (most, 1)] {
+        let mut ranked = clusters.clone();
+        let of = |c: &(f64, f64, usize)| if weight == 0 { c.0 } else { c.1 };
+        ranked.sort_by(|x, y| of(y).total_cmp(&of(x)).then(x.2.cmp(&y.2)));
+        for cluster in ranked {
+            if kept.len() < room && kept.iter().all(|k| differ(k.2, cluster.2)) {
+                kept.push(cluster);
+            }
         }
     }
+    kept.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.2.cmp(&y.2)));
     let rival_of = |centre: usize| {
-        let others = clusters.iter().filter(|(_, _, c)| differ(&proposals[centre], &proposals[*c]));
+        let others = clusters.iter().filter(|(_, _, c)| differ(centre, *c));
         others.map(|(_, doubt, _)| *doubt).fold(0.0, f64::max)
     };
     kept.into_iter()
-        .map(|(support, centre)| Candidate {
+        .map(|(support, doubt, centre)| Candidate {
             a_from_b: proposals[centre].a_from_b,
             support,
+            doubt,
             rival: rival_of(centre),
             members: members(&proposals, centre, options.cluster_angle, reach).copied().collect(),
             decided: false,
@@ -184,7 +196,14 @@ fn decided(join: &DecidedJoin, graph: &ScanGraph, b: &Component) -> Candidate {
         doubt: DECIDED,
         centroid: b.poses.get(&join.in_b).and_then(place).unwrap_or_default(),
     };
-    Candidate { a_from_b: join.a_from_b, support: DECIDED, rival: 0.0, members: vec![member], decided: true }
+    Candidate {
+        a_from_b: join.a_from_b,
+        support: DECIDED,
+        doubt: DECIDED,
+        rival: 0.0,
+        members: vec![member],
+        decided: true,
+    }
 }
 
 /// The support that edges between two components give to a pose that is already known.

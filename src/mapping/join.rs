@@ -8,12 +8,14 @@ use nalgebra::Vector3;
 use super::candidates::{Candidate, near, support_of};
 use super::component::Component;
 use super::options::{JoinLevel, MappingOptions};
-use super::surfaces::{align, judge};
+use super::surfaces::{align, judge, judge_inside};
 use crate::geometry::{Kernel, Pose, rigid_fit};
 use crate::graph::ScanGraph;
 use crate::pairwise::inlier_matches;
 
 const FIT_ITERATIONS: usize = 5;
+/// Edges whose own poses are tried where the fit to all of them fails.
+const SINGLE_STARTS: usize = 6;
 
 /// Why a join was not made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -48,23 +50,79 @@ pub enum Refusal {
     },
 }
 
-/// Checks a candidate's support against a level.
-pub fn check_support(
-    candidate: &Candidate,
-    level: &JoinLevel,
-    options: &MappingOptions,
-) -> Result<(), Refusal> {
-    if candidate.support < level.support {
-        return Err(Refusal::Support { found: candidate.support, needed: level.support });
-    }
-    if candidate.margin(options) < level.support {
-        return Err(Refusal::Rival { support: candidate.support, rival: candidate.rival });
-    }
-    Ok(())
+/// A candidate after alignment.
+#[derive(Debug, Clone, Copy)]
+struct Placed {
+    a_from_b: Pose,
+    /// Support of the edges at the aligned pose.
+    support: f64,
+    /// Share of the judged points that lie in free space.
+    violation: f64,
 }
 
-/// Refines and verifies a candidate. Returns `a_from_b`.
-pub fn verify_join(
+/// The violation that a join may show: little more than the two sides show within themselves, so that clean data, where wrong joins of
+/// alike rooms stand out, is judged more strictly than noisy data; more where support is firm, since a fit that is a little off
+/// violates a little; and never more than the level says.
+#[must_use]
+pub fn allowed_violation(
+    graph: &ScanGraph,
+    a: &Component,
+    b: &Component,
+    support: f64,
+    level: &JoinLevel,
+    options: &MappingOptions,
+) -> f64 {
+    let inside = judge_inside(graph, a).plus(&judge_inside(graph, b)).violation_share();
+    let usual = options.violation_contrast * inside + options.violation_floor;
+    level.violation.min(usual * (support / options.firm_support).max(1.0))
+}
+
+/// Weighs the candidates of two components against each other, best supported first (`candidates`, in that order): the first that keeps
+/// its support and stays clear of free space is taken, unless another that free space does not rule out is nearly as heavy. Returns
+/// `a_from_b`.
+pub fn weigh_join(
+    graph: &ScanGraph,
+    a: &Component,
+    b: &Component,
+    candidates: &[Candidate],
+    level: &JoinLevel,
+    voxel: f64,
+    options: &MappingOptions,
+) -> Result<Pose, Refusal> {
+    let mut first_refusal = None;
+    let support = candidates.first().map_or(0.0, |best| best.support);
+    let level = &JoinLevel { violation: allowed_violation(graph, a, b, support, level, options), ..*level };
+    for (rank, candidate) in candidates.iter().enumerate() {
+        if candidate.support < level.support {
+            let refusal = Refusal::Support { found: candidate.support, needed: level.support };
+            return Err(first_refusal.unwrap_or(refusal));
+        }
+        match place(graph, a, b, candidate, level, voxel, options) {
+            Ok(placed) => {
+                let margin = |rival: f64| placed.support - options.rival_share * rival;
+                // Rivals are looked at only as far as they matter.
+                let rival = candidates
+                    .iter()
+                    .enumerate()
+                    .filter(|(other, c)| *other != rank && margin(c.doubt) < level.support)
+                    .find(|(_, c)| {
+                        let lenient = JoinLevel { support: 0.0, ..*level };
+                        place(graph, a, b, c, &lenient, voxel, options).is_ok()
+                    });
+                return match rival {
+                    Some((_, c)) => Err(Refusal::Rival { support: placed.support, rival: c.doubt }),
+                    None => Ok(placed.a_from_b),
+                };
+            }
+            Err(refusal) => first_refusal = first_refusal.or(Some(refusal)),
+        }
+    }
+    Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support }))
+}
+
+/// Aligns one candidate and checks it alone. Where edges agree only roughly, the fit to all of them can slide into free space while
+/// one of them is right, so the poses of single edges are tried too.
+fn place(
     graph: &ScanGraph,
     a: &Component,
     b: &Component,
@@ -72,24 +130,40 @@ pub fn verify_join(
     level: &JoinLevel,
     voxel: f64,
     options: &MappingOptions,
-) -> Result<Pose, Refusal> {
-    let pooled = pooled_fit(graph, a, b, candidate, voxel);
-    let aligned = align(graph, a, b, &pooled, voxel);
+) -> Result<Placed, Refusal> {
+    let settle = |start: &Pose| {
+        let a_from_b = align(graph, a, b, start, voxel);
+        let support = support_of(graph, a, b, &a_from_b, voxel, options);
+        let counts = judge(graph, a, b, &a_from_b);
+        Placed { a_from_b, support, violation: counts.violation_share() }
+    };
+    let mut best = settle(&pooled_fit(graph, a, b, candidate, voxel));
     if candidate.decided {
-        let agrees = candidate.members.iter().all(|m| near(&aligned, m, voxel, options));
-        return Ok(if agrees { aligned } else { candidate.a_from_b });
+        let agrees = candidate.members.iter().all(|m| near(&best.a_from_b, m, voxel, options));
+        return Ok(Placed { a_from_b: if agrees { best.a_from_b } else { candidate.a_from_b }, ..best });
+    }
+    let passes = |p: &Placed| p.support >= level.support && p.violation <= level.violation;
+    if !passes(&best) && candidate.members.len() > 1 {
+        for member in candidate.members.iter().take(SINGLE_STARTS) {
+            let other = settle(&member.a_from_b);
+            if other.support >= level.support
+                && (other.violation < best.violation || best.support < level.support)
+            {
+                best = other;
+            }
+            if passes(&best) {
+                break;
+            }
+        }
     }
     // The alignment must stay at the pose that the edges voted for.
-    let kept = support_of(graph, a, b, &aligned, voxel, options);
-    if kept < level.support {
-        return Err(Refusal::Support { found: kept, needed: level.support });
+    if best.support < level.support {
+        return Err(Refusal::Support { found: best.support, needed: level.support });
     }
-    let counts = judge(graph, a, b, &aligned);
-    let found = counts.violation_share();
-    if found > level.violation {
-        return Err(Refusal::Violation { found, allowed: level.violation });
+    if best.violation > level.violation {
+        return Err(Refusal::Violation { found: best.violation, allowed: level.violation });
     }
-    Ok(aligned)
+    Ok(best)
 }
 
 /// Pools the matches of all edges in the cluster, against landmarks where there are tracks and against the neighbours' keypoints

@@ -2,17 +2,17 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::candidates::{Candidate, best_candidate, support_of};
+use super::candidates::{CLUSTERS, Candidate, best_candidate, candidates, support_of};
 use super::component::Component;
 use super::consistency::{supports, thrown, weakest_cut};
 use super::initial_pair::initial_pairs;
-use super::join::{Refusal, check_support, verify_join};
+use super::join::{Refusal, allowed_violation, pooled_fit, weigh_join};
 use super::next_scan::visible_landmarks;
 use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{dense, local_bundle_adjustment, neighborhood, pose_graph};
 use super::snapshot::WaitingReason;
-use super::surfaces::judge_inside;
+use super::surfaces::judge;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
@@ -23,7 +23,9 @@ use crate::pairwise::PairKey;
 struct NextScan {
     component: usize,
     scan: ScanKey,
-    candidate: Candidate,
+    /// Its support by its best candidate.
+    support: f64,
+    candidates: Vec<Candidate>,
     /// Spread of the landmarks that it sees, then their number.
     visible: (usize, usize),
 }
@@ -96,14 +98,14 @@ impl Mapper {
             let component = &self.components[next.component];
             let single = Component::single(next.scan);
             let link = (component.gauge, next.scan);
-            if self.already_refused(link, next.candidate.support, level) {
+            if self.already_refused(link, next.support, level) {
                 continue;
             }
-            match verify_join(graph, component, &single, &next.candidate, level, voxel, options) {
-                Ok(model_from_scan) => {
+            match weigh_join(graph, component, &single, &next.candidates, level, voxel, options) {
+                Ok(a_from_b) => {
                     self.waiting.remove(&next.scan);
                     let component = &mut self.components[next.component];
-                    component.absorb(single, &model_from_scan, graph, options);
+                    component.absorb(single, &a_from_b, graph, options);
                     let free = neighborhood(component, next.scan, options);
                     guarded(graph, component, options, |component| {
                         local_bundle_adjustment(component, next.scan, voxel, options, control)
@@ -115,7 +117,7 @@ impl Mapper {
                     return Ok(Some(next.scan));
                 }
                 Err(refusal) => {
-                    self.refused.insert(link, (next.candidate.support, level.support));
+                    self.refused.insert(link, (next.support, level.support));
                     self.waiting.insert(next.scan, Some(refusal));
                 }
             }
@@ -135,25 +137,23 @@ impl Mapper {
         for scan in self.free() {
             let single = Component::single(scan);
             for (index, component) in self.components.iter().enumerate() {
-                let Some(candidate) = best_candidate(graph, component, &single, voxel, options) else {
-                    continue;
-                };
-                match check_support(&candidate, level, options) {
-                    Ok(()) => {
-                        let visible = visible_landmarks(graph, component, scan, &candidate);
-                        let visible = (visible.score, visible.keypoints.len());
-                        ranked.push(NextScan { component: index, scan, candidate, visible });
-                    }
-                    Err(refusal) => {
-                        self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
-                    }
+                let candidates = candidates(graph, component, &single, voxel, options, CLUSTERS);
+                let Some(best) = candidates.first() else { continue };
+                let support = best.support;
+                if support < level.support {
+                    let refusal = Refusal::Support { found: support, needed: level.support };
+                    self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
+                } else {
+                    let visible = visible_landmarks(graph, component, scan, best);
+                    let visible = (visible.score, visible.keypoints.len());
+                    ranked.push(NextScan { component: index, scan, support, candidates, visible });
                 }
             }
         }
         ranked.sort_by(|x, y| {
             y.visible
                 .cmp(&x.visible)
-                .then(y.candidate.support.total_cmp(&x.candidate.support))
+                .then(y.support.total_cmp(&x.support))
                 .then(x.scan.cmp(&y.scan))
                 .then(x.component.cmp(&y.component))
         });
@@ -173,14 +173,13 @@ impl Mapper {
         for (first, second) in initial_pairs(graph, &free, level, options) {
             control.check()?;
             let (mut a, b) = (Component::single(first), Component::single(second));
-            let Some(candidate) = best_candidate(graph, &a, &b, voxel, options) else { continue };
+            let candidates = candidates(graph, &a, &b, voxel, options, CLUSTERS);
+            let Some(support) = candidates.first().map(|best| best.support) else { continue };
             let link = (first.min(second), first.max(second));
-            if self.already_refused(link, candidate.support, level) {
+            if self.already_refused(link, support, level) {
                 continue;
             }
-            let verdict = check_support(&candidate, level, options)
-                .and_then(|()| verify_join(graph, &a, &b, &candidate, level, voxel, options));
-            match verdict {
+            match weigh_join(graph, &a, &b, &candidates, level, voxel, options) {
                 Ok(a_from_b) => {
                     a.absorb(b, &a_from_b, graph, options);
                     self.waiting.remove(&first);
@@ -190,7 +189,7 @@ impl Mapper {
                     return Ok(true);
                 }
                 Err(refusal) => {
-                    self.refused.insert(link, (candidate.support, level.support));
+                    self.refused.insert(link, (support, level.support));
                     for scan in [first, second] {
                         self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
                     }
@@ -209,37 +208,30 @@ impl Mapper {
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<bool, Cancelled> {
-        let mut ranked: Vec<(f64, usize, usize, Candidate)> = Vec::new();
+        let mut ranked: Vec<(f64, usize, usize, Vec<Candidate>)> = Vec::new();
         for i in 0..self.components.len() {
             for j in i + 1..self.components.len() {
                 let (a, b) = self.larger_first(i, j);
-                let Some(candidate) =
-                    best_candidate(graph, &self.components[a], &self.components[b], voxel, options)
-                else {
-                    continue;
-                };
-                if check_support(&candidate, level, options).is_ok() {
-                    ranked.push((candidate.margin(options), a, b, candidate));
+                let found =
+                    candidates(graph, &self.components[a], &self.components[b], voxel, options, CLUSTERS);
+                match found.first() {
+                    Some(best) if best.support >= level.support => {
+                        ranked.push((best.margin(options), a, b, found));
+                    }
+                    _ => {}
                 }
             }
         }
         ranked.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
-        for (_, a, b, candidate) in ranked {
+        for (_, a, b, candidates) in ranked {
             control.check()?;
             let link = (self.components[a].gauge, self.components[b].gauge);
+            let Some(candidate) = candidates.first() else { continue };
             if self.already_refused(link, candidate.support, level) {
                 continue;
             }
-            let level = &self.level_between(graph, a, b, level, options);
-            match verify_join(
-                graph,
-                &self.components[a],
-                &self.components[b],
-                &candidate,
-                level,
-                voxel,
-                options,
-            ) {
+            let (first, second) = (&self.components[a], &self.components[b]);
+            match weigh_join(graph, first, second, &candidates, level, voxel, options) {
                 Ok(a_from_b) => {
                     let other = self.components[b].clone();
                     self.components[a].absorb(other, &a_from_b, graph, options);
@@ -247,12 +239,55 @@ impl Mapper {
                     self.joins_since_refinement += 1;
                     return Ok(true);
                 }
-                Err(_) => {
+                Err(refusal) => {
+                    if let Refusal::Violation { .. } = refusal
+                        && let Some(joined) =
+                            self.bent_join(graph, (a, b), candidate, level, voxel, options, control)?
+                    {
+                        self.components[a] = joined;
+                        self.components.remove(b);
+                        self.joins_since_refinement += 1;
+                        return Ok(true);
+                    }
                     self.refused.insert(link, (candidate.support, level.support));
                 }
             }
         }
         Ok(false)
+    }
+
+    /// A join of two components that are each a little bent, so that no rigid motion fits all that they share: they are joined on
+    /// trial, adjusted together, and judged as they then stand. `None` when that does not help either.
+    #[expect(clippy::too_many_arguments, reason = "the arguments of every step, and which two components")]
+    fn bent_join(
+        &self,
+        graph: &ScanGraph,
+        (a, b): (usize, usize),
+        candidate: &Candidate,
+        level: &JoinLevel,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<Option<Component>, Cancelled> {
+        let (a, b) = (&self.components[a], &self.components[b]);
+        let mut joined = a.clone();
+        joined.absorb(b.clone(), &pooled_fit(graph, a, b, candidate, voxel), graph, options);
+        let before = joined.clone();
+        pose_graph(graph, &mut joined, voxel, options, control)?;
+        dense(graph, &mut joined, None, voxel, control)?;
+        if !thrown(graph, &before, &joined, options).is_empty() {
+            return Ok(None);
+        }
+        let part = |of: &Component| {
+            let mut part = of.clone();
+            part.poses.retain(|key, pose| joined.poses.get(key).map(|moved| *pose = *moved).is_some());
+            part
+        };
+        let (x, y) = (part(a), part(b));
+        let found = judge(graph, &x, &y, &Pose::identity()).violation_share();
+        let allowed = allowed_violation(graph, a, b, candidate.support, level, options);
+        let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
+        Ok((found <= allowed && kept >= level.support).then_some(joined))
     }
 
     /// Filtering: takes out scans that have clearly more support at another pose than at their own. They wait, and may register
@@ -421,23 +456,6 @@ impl Mapper {
             }
             None => WaitingReason::NoVerifiedPair { tried, best_support: 0.0, needed },
         }
-    }
-
-    /// A level for joining two components: they may violate each other's free space little more than each violates its own, so clean
-    /// data, where wrong joins of alike rooms stand out, is judged more strictly than noisy data.
-    fn level_between(
-        &self,
-        graph: &ScanGraph,
-        a: usize,
-        b: usize,
-        level: &JoinLevel,
-        options: &MappingOptions,
-    ) -> JoinLevel {
-        let inside = judge_inside(graph, &self.components[a])
-            .plus(&judge_inside(graph, &self.components[b]))
-            .violation_share();
-        let usual = options.violation_contrast * inside + options.violation_floor;
-        JoinLevel { violation: level.violation.min(usual), ..*level }
     }
 
     fn larger_first(&self, i: usize, j: usize) -> (usize, usize) {

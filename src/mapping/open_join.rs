@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::candidates::{Candidate, candidates};
 use super::component::Component;
 use super::decision::between_own_frames;
-use super::join::{Refusal, check_support, pooled_fit};
+use super::join::{Refusal, pooled_fit};
 use super::options::MappingOptions;
 use super::surfaces::{align, judge};
 use crate::cloud::ScanKey;
@@ -131,9 +131,12 @@ pub fn open_joins(
             Some(Some(refusal @ Refusal::Contradicted { .. })) => Some(*refusal),
             _ => None,
         });
-        let refusal = known.unwrap_or_else(|| match check_support(best, last, options) {
-            Err(refusal) => refusal,
-            Ok(()) => Refusal::Violation { found: violation, allowed: last.violation },
+        let refusal = known.unwrap_or(if best.support < last.support {
+            Refusal::Support { found: best.support, needed: last.support }
+        } else if best.margin(options) < last.support {
+            Refusal::Rival { support: best.support, rival: best.rival }
+        } else {
+            Refusal::Violation { found: violation, allowed: last.violation }
         });
         listed.push(OpenJoin {
             a: member.in_a,
