@@ -152,7 +152,7 @@ pub fn weakest_cut(
 /// A pair says that much by itself (softplus of its log-odds) when it counts as a witness: a likelihood of 0.86.
 const WITNESS: f64 = 2.0;
 /// A component is contradicted when this share of its witnesses speak against it …
-const CONTRADICTED_SHARE: f64 = 0.02;
+const CONTRADICTED_SHARE: f64 = 0.05;
 /// … and at least this many.
 const CONTRADICTED_PAIRS: usize = 3;
 

@@ -25,7 +25,9 @@ pub fn grow(
     let mut rounds = 0;
     loop {
         join_all(mapper, graph, voxel, options, control)?;
-        if mapper.filter_scans(graph, voxel, options) > 0 || mapper.undo_contradicted(graph, options) > 0 {
+        if mapper.filter_scans(graph, voxel, options) > 0
+            || mapper.undo_contradicted(graph, voxel, options) > 0
+        {
             continue;
         }
         let fresh: BTreeSet<_> =

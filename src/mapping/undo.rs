@@ -3,6 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::candidates::best_candidate;
 use super::component::Component;
 use super::consistency::{Contradiction, supports, testimony};
 use super::join::Refusal;
@@ -13,19 +14,18 @@ use crate::cloud::ScanKey;
 use crate::graph::ScanGraph;
 
 impl Mapper {
-    /// Takes apart every component that its own pairs condemn, unless a client's join holds in it: then the client has told alike places
-    /// apart, and pairs cannot. Its scans wait, and no step joins them again before
+    /// Takes apart every component that its own pairs condemn. Its scans wait, and no step joins them again before
     /// [`Mapper::loosen`] decides all anew. Returns how many components were taken apart.
-    pub fn undo_contradicted(&mut self, graph: &ScanGraph, options: &MappingOptions) -> usize {
+    pub fn undo_contradicted(&mut self, graph: &ScanGraph, voxel: f64, options: &MappingOptions) -> usize {
         let mut kept = Vec::new();
         let mut undone = 0;
         for component in std::mem::take(&mut self.components) {
-            let placed = |scan| component.poses.contains_key(&scan);
-            if options.decisions.joined_pairs().any(|pair| placed(pair.a) && placed(pair.b)) {
+            // Where a client joined scans, the client has the last word.
+            if options.decisions.joined_pairs().any(|pair| component.poses.contains_key(&pair.a)) {
                 kept.push(component);
                 continue;
             }
-            let testimony = testimony(graph, &component, options);
+            let testimony = testimony(graph, &self.with_torn(graph, &component, voxel, options), options);
             let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) else {
                 kept.push(component);
                 continue;
@@ -43,6 +43,28 @@ impl Mapper {
         }
         self.components = kept;
         undone
+    }
+}
+
+impl Mapper {
+    /// The component with the waiting scans that fit it at more than one pose, at their best: they are witnesses too.
+    fn with_torn(
+        &self,
+        graph: &ScanGraph,
+        component: &Component,
+        voxel: f64,
+        options: &MappingOptions,
+    ) -> Component {
+        let mut more = component.clone();
+        for (scan, refusal) in &self.waiting {
+            if let Some(Refusal::Rival { .. }) = refusal
+                && let Some(best) =
+                    best_candidate(graph, component, &Component::single(*scan), voxel, options)
+            {
+                more.poses.insert(*scan, best.a_from_b);
+            }
+        }
+        more
     }
 }
 

@@ -1,0 +1,119 @@
+//! The live model on simulated buildings with known truth: what clients decide holds, alike rooms are not folded onto each other.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use cairn::cloud::ScanKey;
+use cairn::control::{CancelToken, Control, Seed, Silent};
+use cairn::features::{
+    PrepareOptions, PreparedScan, SensorPosition, choose_resolution, natural_resolution, prepare,
+};
+use cairn::geometry::Pose;
+use cairn::mapping::{Decision, LiveModel, MappingOptions, ModelSnapshot, ScanOutcome};
+use cairn::simulate::{BuildingOptions, Layout, SurveyOptions, simulate};
+
+/// Prepared scans and the true `model_from_scan` of each.
+struct Truth {
+    scans: Vec<Arc<PreparedScan>>,
+    poses: BTreeMap<ScanKey, Pose>,
+}
+
+fn survey(building: BuildingOptions, stations: usize, seed: u64) -> Truth {
+    let options = SurveyOptions { building, stations, seed: Seed(seed), ..SurveyOptions::default() };
+    let survey = simulate(&options).unwrap();
+    let natural: Vec<f64> = survey.scans.iter().map(|s| natural_resolution(&s.cloud.points)).collect();
+    let settings = PrepareOptions::at(choose_resolution(&natural), Seed(0));
+    let mut truth = Truth { scans: Vec::new(), poses: BTreeMap::new() };
+    let token = CancelToken::new();
+    for scan in &survey.scans {
+        let key = ScanKey::of_hash(&blake3::hash(scan.name.as_bytes()), &[]);
+        let control = Control { cancel: &token, observer: &Silent };
+        let prepared = prepare(key, &scan.cloud, SensorPosition::Assumed, &settings, control).unwrap();
+        truth.scans.push(Arc::new(prepared));
+        truth.poses.insert(key, scan.model_from_scan);
+    }
+    truth
+}
+
+fn with_control<T>(run: impl FnOnce(Control<'_>) -> T) -> T {
+    run(Control { cancel: &CancelToken::new(), observer: &Silent })
+}
+
+fn registered(truth: &Truth) -> LiveModel {
+    let mut model = LiveModel::new(MappingOptions::default());
+    with_control(|control| model.register(truth.scans.clone(), control)).unwrap();
+    model
+}
+
+/// Where a scan is: its component and `model_from_scan`.
+fn place(snapshot: &ModelSnapshot, key: ScanKey) -> Option<(usize, Pose)> {
+    match snapshot.scans.get(&key)? {
+        ScanOutcome::Registered(place) => Some((place.component, place.model_from_scan)),
+        ScanOutcome::Waiting(_) => None,
+    }
+}
+
+/// How far two scans of one component are from where they should be to each other: degrees, metres. `None` if they are not in one.
+fn error(snapshot: &ModelSnapshot, truth: &Truth, x: ScanKey, y: ScanKey) -> Option<(f64, f64)> {
+    let ((in_x, x_pose), (in_y, y_pose)) = (place(snapshot, x)?, place(snapshot, y)?);
+    let difference = (x_pose.inverse() * y_pose).inverse() * (truth.poses[&x].inverse() * truth.poses[&y]);
+    (in_x == in_y).then(|| (difference.angle().to_degrees(), difference.translation.norm()))
+}
+
+#[test]
+fn what_a_client_decides_holds_until_it_is_taken_back() {
+    let truth = survey(BuildingOptions { rooms: 2, ..BuildingOptions::default() }, 8, 3);
+    let mut model = registered(&truth);
+    let (x, y) = (truth.scans[0].key, truth.scans[5].key);
+    let before = model.snapshot();
+    assert!(error(&before, &truth, x, y).is_some_and(|(_, metres)| metres < 0.1));
+
+    with_control(|control| model.decide(&[Decision::forbid(x, y, None)], control)).unwrap();
+    let apart = model.snapshot();
+    assert_eq!(error(&apart, &truth, x, y), None, "two scans that may not be together are together");
+    assert_eq!(apart.decisions.as_slice().len(), 1);
+
+    let x_from_y = truth.poses[&x].inverse() * truth.poses[&y];
+    with_control(|control| model.decide(&[Decision::join(x, y, &x_from_y)], control)).unwrap();
+    assert!(error(&model.snapshot(), &truth, x, y).is_some_and(|(_, metres)| metres < 0.1));
+
+    // A wrong decision is obeyed too: the client has the last word.
+    let elsewhere = Pose::from_translation(nalgebra::Vector3::new(50.0, 0.0, 0.0)) * x_from_y;
+    with_control(|control| model.decide(&[Decision::join(x, y, &elsewhere)], control)).unwrap();
+    let obeyed = model.snapshot();
+    assert!(error(&obeyed, &truth, x, y).is_some_and(|(_, metres)| (metres - 50.0).abs() < 1.0));
+
+    with_control(|control| model.decide(&[], control)).unwrap();
+    let after = model.snapshot();
+    assert!(error(&after, &truth, x, y).is_some_and(|(_, metres)| metres < 0.1));
+    assert!(after.decisions.as_slice().is_empty());
+}
+
+#[test]
+fn identical_rooms_are_not_folded_onto_each_other() {
+    let building = BuildingOptions { layout: Layout::TwinRooms, density: 0.3, ..BuildingOptions::default() };
+    let truth = survey(building, 16, 100);
+    let snapshot = registered(&truth).snapshot();
+    for (i, x) in truth.scans.iter().enumerate() {
+        for y in &truth.scans[i + 1..] {
+            if let Some((degrees, metres)) = error(&snapshot, &truth, x.key, y.key) {
+                assert!(degrees < 5.0 && metres < 0.5, "{} and {} are {metres} m off", x.key, y.key);
+            }
+        }
+    }
+    assert!(!snapshot.open_joins.is_empty(), "what could not be decided is listed");
+    for undone in &snapshot.undone {
+        assert!(undone.evidence.len() >= 3 && undone.evidence.first() == undone.evidence.last());
+        assert!(undone.distance > 0.5 || undone.angle > 0.1);
+    }
+}
+
+#[test]
+fn the_model_is_the_same_at_one_and_at_two_threads() {
+    let truth = survey(BuildingOptions { rooms: 2, ..BuildingOptions::default() }, 6, 4);
+    let at = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| registered(&truth).snapshot())
+    };
+    assert_eq!(at(1), at(2));
+}
