@@ -149,10 +149,68 @@ pub fn weakest_cut(
     Some((side, cut))
 }
 
+/// The cut of least support that separates two scans of a component: the side of `from`, and the support across (Edmonds, Karp:
+/// "Theoretical improvements in algorithmic efficiency for network flow problems", JACM 1972).
+#[must_use]
+pub fn separating_cut(
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    from: ScanKey,
+    to: ScanKey,
+) -> Option<(BTreeSet<ScanKey>, f64)> {
+    let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
+    let index: BTreeMap<ScanKey, usize> = keys.iter().enumerate().map(|(i, key)| (*key, i)).collect();
+    let (&source, &sink) = (index.get(&from)?, index.get(&to)?);
+    let n = keys.len();
+    let mut spare = vec![0.0_f64; n * n];
+    for ((a, b), support) in supports {
+        if let (Some(&i), Some(&j)) = (index.get(a), index.get(b)) {
+            spare[i * n + j] += support;
+            spare[j * n + i] += support;
+        }
+    }
+    let mut flow = 0.0;
+    loop {
+        let mut before: Vec<Option<usize>> = vec![None; n];
+        before[source] = Some(source);
+        let mut queue = std::collections::VecDeque::from([source]);
+        while let Some(i) = queue.pop_front() {
+            for j in 0..n {
+                if before[j].is_none() && spare[i * n + j] > NO_SUPPORT {
+                    before[j] = Some(i);
+                    queue.push_back(j);
+                }
+            }
+        }
+        if before[sink].is_none() {
+            let side = (0..n).filter(|i| before[*i].is_some()).map(|i| keys[i]).collect();
+            return Some((side, flow));
+        }
+        let mut path = Vec::new();
+        let mut at = sink;
+        while at != source {
+            let previous = before[at]?;
+            path.push((previous, at));
+            at = previous;
+        }
+        let least = path.iter().map(|(i, j)| spare[i * n + j]).fold(f64::INFINITY, f64::min);
+        for (i, j) in path {
+            spare[i * n + j] -= least;
+            spare[j * n + i] += least;
+        }
+        flow += least;
+    }
+}
+
+/// Support below this is none.
+const NO_SUPPORT: f64 = 1e-6;
+
 /// A pair says that much by itself (softplus of its log-odds) when it counts as a witness: a likelihood of 0.86.
 const WITNESS: f64 = 2.0;
-/// A component is contradicted when this share of its witnesses speak against it …
-const CONTRADICTED_SHARE: f64 = 0.05;
+/// A pair speaks against a component only if its pose differs by this many times what makes a rival.
+const CLEARLY_DIFFERENT: f64 = 2.0;
+/// A component is contradicted when what is said against it, beyond a witness's least, comes to this for each witness for it …
+const CONTRADICTED_WEIGHT: f64 = 0.08;
 /// … and at least this many.
 const CONTRADICTED_PAIRS: usize = 3;
 
@@ -180,13 +238,13 @@ pub struct Testimony {
 }
 
 impl Testimony {
-    /// Whether too many witnesses speak against the component for it to be right. Chance makes about one in a hundred; folding
-    /// alike rooms onto each other makes one in three.
+    /// Whether too much is said against the component for it to be right. Where all is right, chance says at most 0.04 for each
+    /// witness; where alike rooms were folded onto each other it is 0.15 and more.
     #[must_use]
     pub fn condemns(&self) -> bool {
-        let against = self.contradictions.len();
-        against >= CONTRADICTED_PAIRS
-            && against as f64 >= CONTRADICTED_SHARE * (self.agreeing + against) as f64
+        let weight: f64 = self.contradictions.iter().map(|c| c.evidence - WITNESS).sum();
+        self.contradictions.len() >= CONTRADICTED_PAIRS
+            && weight >= CONTRADICTED_WEIGHT * self.agreeing.max(1) as f64
     }
 }
 
@@ -213,7 +271,10 @@ pub fn testimony(graph: &ScanGraph, component: &Component, options: &MappingOpti
                 let evidence = softplus(h.hypothesis.logit);
                 if angle < options.rival_angle && distance < reach {
                     agreeing = agreeing.max(evidence).max(softplus(h.score));
-                } else if other.is_none_or(|known| evidence > known.evidence) {
+                } else if (angle > CLEARLY_DIFFERENT * options.rival_angle
+                    || distance > CLEARLY_DIFFERENT * reach)
+                    && other.is_none_or(|known| evidence > known.evidence)
+                {
                     other = Some(Contradiction { pair: edge.pair, evidence, angle, distance });
                 }
             }
@@ -234,14 +295,32 @@ mod tests {
     use super::*;
     use crate::mapping::tracks::Tracks;
 
+    fn six() -> Component {
+        Component {
+            gauge: ScanKey(1),
+            poses: (1..=6).map(|k| (ScanKey(k), Pose::identity())).collect(),
+            tracks: Tracks::default(),
+        }
+    }
+
+    #[test]
+    fn two_scans_are_separated_where_least_holds_them_together() {
+        let key = ScanKey;
+        let links =
+            [(1, 2, 5.0), (2, 3, 5.0), (1, 3, 5.0), (4, 5, 6.0), (5, 6, 0.1), (4, 6, 0.1), (3, 4, 1.5)];
+        let supports = links.iter().map(|&(a, b, w)| ((key(a), key(b)), w)).collect();
+        let (side, cut) = separating_cut(&six(), &supports, key(1), key(5)).unwrap();
+        assert_eq!(side, BTreeSet::from([key(1), key(2), key(3)]));
+        assert!((cut - 1.5).abs() < 1e-9);
+        let (side, cut) = separating_cut(&six(), &supports, key(6), key(1)).unwrap();
+        assert_eq!(side, BTreeSet::from([key(6)]));
+        assert!((cut - 0.2).abs() < 1e-9);
+    }
+
     #[test]
     fn the_weakest_cut_is_found() {
         let key = ScanKey;
-        let component = Component {
-            gauge: key(1),
-            poses: (1..=6).map(|k| (key(k), Pose::identity())).collect(),
-            tracks: Tracks::default(),
-        };
+        let component = six();
         // Two triangles joined by a light edge and a lighter one.
         let links =
             [(1, 2, 5.0), (2, 3, 5.0), (1, 3, 5.0), (4, 5, 6.0), (5, 6, 6.0), (3, 4, 1.5), (2, 5, 0.5)];

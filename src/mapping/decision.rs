@@ -94,6 +94,14 @@ impl Decisions {
         Self { list }
     }
 
+    /// These decisions and more. A client's join stands against any of them.
+    #[must_use]
+    pub fn with(&self, more: &[Decision]) -> Self {
+        let mut list: Vec<Decision> = more.to_vec();
+        list.extend_from_slice(&self.list);
+        Self::new(&list)
+    }
+
     /// The decisions that hold.
     #[must_use]
     pub fn as_slice(&self) -> &[Decision] {

@@ -329,17 +329,15 @@ impl Mapper {
         let largest =
             (0..self.components.len()).max_by_key(|i| (self.components[*i].len(), std::cmp::Reverse(*i)));
         let home = |scan: &ScanKey| self.components.iter().position(|c| c.poses.contains_key(scan));
-        let retrieval = Retrieval::new(graph);
+        let outside =
+            graph.scans().map(|s| s.key()).filter(|scan| home(scan).is_none() || home(scan) != largest);
         let mut pairs = BTreeSet::new();
-        for scan in graph.scans().map(|s| s.key()) {
+        for (scan, others) in Retrieval::new(graph).ranked_all(outside) {
             let own = home(&scan);
-            if own.is_some() && own == largest {
-                continue;
-            }
-            let fresh =
-                retrieval.ranked(scan).into_iter().map(|(other, _)| other).filter(|other| {
-                    (own.is_none() || home(other) != own) && graph.edge(scan, *other).is_none()
-                });
+            let fresh = others
+                .into_iter()
+                .map(|(other, _)| other)
+                .filter(|other| (own.is_none() || home(other) != own) && graph.edge(scan, *other).is_none());
             pairs.extend(fresh.take(options.retrieved).map(|other| PairKey::of(scan, other)));
         }
         pairs
@@ -468,7 +466,7 @@ impl Mapper {
             .is_some_and(|(then, at)| (support - then).abs() < 0.05 * then.abs() && level.support >= *at)
     }
 
-    fn dissolve_small(&mut self) {
+    pub(super) fn dissolve_small(&mut self) {
         let (kept, small): (Vec<Component>, Vec<Component>) =
             std::mem::take(&mut self.components).into_iter().partition(|c| c.len() >= 2);
         self.components = kept;

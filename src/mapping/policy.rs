@@ -13,6 +13,9 @@ use crate::control::{Cancelled, Control, Stage};
 use crate::graph::ScanGraph;
 use crate::pairwise::PairResult;
 
+/// Rounds in which contradicted joins are undone while the model grows once; after that what was undone stays apart.
+const MAX_UNDONE: usize = 20;
+
 /// Grows the model until nothing more fits. `pairs` collects the results of pairs that widening tried.
 pub fn grow(
     mapper: &mut Mapper,
@@ -23,26 +26,33 @@ pub fn grow(
     control: Control<'_>,
 ) -> Result<(), Cancelled> {
     let mut rounds = 0;
+    let mut undone = 0;
+    let mut options = options.clone();
     loop {
-        join_all(mapper, graph, voxel, options, control)?;
-        if mapper.filter_scans(graph, voxel, options) > 0
-            || mapper.undo_contradicted(graph, voxel, options) > 0
-        {
+        join_all(mapper, graph, voxel, &options, control)?;
+        if mapper.filter_scans(graph, voxel, &options) > 0 {
             continue;
         }
+        if let Some(bans) = mapper.undo_contradicted(graph, voxel, &options) {
+            undone += 1;
+            options.decisions = options.decisions.with(&bans);
+            if undone < MAX_UNDONE {
+                continue;
+            }
+        }
         let fresh: BTreeSet<_> =
-            if rounds < options.widening_rounds { mapper.widen(graph, options) } else { BTreeSet::new() };
+            if rounds < options.widening_rounds { mapper.widen(graph, &options) } else { BTreeSet::new() };
         if fresh.is_empty() {
             break;
         }
         rounds += 1;
         pairs.extend(graph.try_pairs(&fresh, &options.support, control)?);
     }
-    if mapper.refinement_is_due(options) {
-        mapper.refine(graph, voxel, options, control)?;
+    if mapper.refinement_is_due(&options) {
+        mapper.refine(graph, voxel, &options, control)?;
     }
     mapper.sort_components();
-    mapper.list_open_joins(graph, voxel, options, control)
+    mapper.list_open_joins(graph, voxel, &options, control)
 }
 
 /// Makes joins, strictest level first, until no level makes any.

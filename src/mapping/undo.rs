@@ -1,11 +1,13 @@
-//! Taking back what later evidence contradicts: a component that too many pairs speak against is taken apart, and its scans wait until
-//! a new scan or a decision changes what is known. Nothing in it can be told from its twin, so nothing of it is kept.
+//! Taking back what later evidence contradicts. Where the pairs that speak against a component all speak against one join in it, that
+//! join is undone and its pose is not tried again; where they are too many for that, alike places were folded onto each other: nothing
+//! there can be told from its twin, so nothing is kept, and the scans wait until a new scan or a decision changes what is known.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::candidates::best_candidate;
 use super::component::Component;
-use super::consistency::{Contradiction, supports, testimony};
+use super::consistency::{Contradiction, Testimony, separating_cut, supports, testimony};
+use super::decision::{Decision, between_own_frames};
 use super::join::Refusal;
 use super::mapper::Mapper;
 use super::open_join::Undone;
@@ -13,37 +15,106 @@ use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::graph::ScanGraph;
 
+/// A join is undone when what pairs say against it comes to this share of its support …
+const AGAINST_SHARE: f64 = 0.5;
+/// … and at least this many pairs say it.
+const AGAINST_PAIRS: usize = 2;
+/// Contradictions whose separation is tried, the strongest first.
+const TRIED: usize = 8;
+
+/// The weakest place of a component, given what speaks against it.
+struct Tear {
+    side: BTreeSet<ScanKey>,
+    strongest: Contradiction,
+}
+
 impl Mapper {
-    /// Takes apart every component that its own pairs condemn. Its scans wait, and no step joins them again before
-    /// [`Mapper::loosen`] decides all anew. Returns how many components were taken apart.
-    pub fn undo_contradicted(&mut self, graph: &ScanGraph, voxel: f64, options: &MappingOptions) -> usize {
-        let mut kept = Vec::new();
-        let mut undone = 0;
-        for component in std::mem::take(&mut self.components) {
+    /// Undoes what pairs contradict. Returns the poses that are not to be tried again while the model grows, or `None` if nothing
+    /// was undone.
+    pub fn undo_contradicted(
+        &mut self,
+        graph: &ScanGraph,
+        voxel: f64,
+        options: &MappingOptions,
+    ) -> Option<Vec<Decision>> {
+        let mut pending = std::mem::take(&mut self.components);
+        let mut bans = None;
+        while let Some(mut component) = pending.pop() {
             // Where a client joined scans, the client has the last word.
             if options.decisions.joined_pairs().any(|pair| component.poses.contains_key(&pair.a)) {
-                kept.push(component);
+                self.components.push(component);
                 continue;
             }
+            let supports = supports(graph, &component, options);
             let testimony = testimony(graph, &self.with_torn(graph, &component, voxel, options), options);
-            let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) else {
-                kept.push(component);
-                continue;
-            };
-            self.undone.push(record(graph, &component, strongest, options));
-            let refusal = Refusal::Contradicted {
-                against: testimony.contradictions.len(),
-                agreeing: testimony.agreeing,
-            };
-            for scan in component.poses.into_keys() {
-                self.doubted.insert(scan);
-                self.waiting.insert(scan, Some(refusal));
+            if let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) {
+                self.undone.push(record(&supports, component.poses.keys().copied().collect(), strongest));
+                self.doubt(component, &testimony);
+                bans.get_or_insert_with(Vec::new);
+            } else if let Some(tear) = tear(&component, &supports, &testimony) {
+                bans.get_or_insert_with(Vec::new).extend(ban(graph, &component, &supports, &tear.side));
+                self.undone.push(record(&supports, tear.side.iter().copied().collect(), &tear.strongest));
+                pending.extend(component.split_off(&tear.side, options));
+                pending.push(component);
+            } else {
+                self.components.push(component);
             }
-            undone += 1;
         }
-        self.components = kept;
-        undone
+        self.dissolve_small();
+        self.sort_components();
+        bans
     }
+
+    /// Lets the scans of a component wait, and not be joined before all is decided anew.
+    fn doubt(&mut self, component: Component, testimony: &Testimony) {
+        let refusal =
+            Refusal::Contradicted { against: testimony.contradictions.len(), agreeing: testimony.agreeing };
+        for scan in component.poses.into_keys() {
+            self.doubted.insert(scan);
+            self.waiting.insert(scan, Some(refusal));
+        }
+    }
+}
+
+/// Where a component comes apart: the cut between two contradicting scans that holds least compared with what speaks against it.
+fn tear(
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    testimony: &Testimony,
+) -> Option<Tear> {
+    let inside: Vec<&Contradiction> = testimony
+        .contradictions
+        .iter()
+        .filter(|c| component.poses.contains_key(&c.pair.a) && component.poses.contains_key(&c.pair.b))
+        .collect();
+    for strongest in inside.iter().take(TRIED) {
+        let (side, support) = separating_cut(component, supports, strongest.pair.a, strongest.pair.b)?;
+        let across: Vec<&&Contradiction> =
+            inside.iter().filter(|c| side.contains(&c.pair.a) != side.contains(&c.pair.b)).collect();
+        let against: f64 = across.iter().map(|c| c.evidence).sum();
+        if across.len() >= AGAINST_PAIRS && against >= AGAINST_SHARE * support {
+            let side = if 2 * side.len() > component.len() {
+                component.poses.keys().filter(|key| !side.contains(key)).copied().collect()
+            } else {
+                side
+            };
+            return Some(Tear { side, strongest: **strongest });
+        }
+    }
+    None
+}
+
+/// Forbids the pose that a join had, by its strongest edge.
+fn ban(
+    graph: &ScanGraph,
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    side: &BTreeSet<ScanKey>,
+) -> Option<Decision> {
+    let across = supports.iter().filter(|((a, b), _)| side.contains(a) != side.contains(b));
+    let ((a, b), _) = across.max_by(|x, y| x.1.total_cmp(y.1).then(y.0.cmp(x.0)))?;
+    let local = component.poses.get(a)?.inverse() * *component.poses.get(b)?;
+    Some(Decision::forbid(*a, *b, Some(&between_own_frames(graph, *a, *b, &local)?)))
 }
 
 impl Mapper {
@@ -69,13 +140,11 @@ impl Mapper {
 }
 
 fn record(
-    graph: &ScanGraph,
-    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    scans: Vec<ScanKey>,
     strongest: &Contradiction,
-    options: &MappingOptions,
 ) -> Undone {
-    let supports = supports(graph, component, options);
-    let mut evidence = firmest_path(&supports, strongest.pair.a, strongest.pair.b);
+    let mut evidence = firmest_path(supports, strongest.pair.a, strongest.pair.b);
     let support_before = evidence
         .windows(2)
         .filter_map(|step| supports.get(&(step[0].min(step[1]), step[0].max(step[1]))))
@@ -83,7 +152,7 @@ fn record(
         .fold(f64::INFINITY, f64::min);
     evidence.push(strongest.pair.a);
     Undone {
-        scans: component.poses.keys().copied().collect(),
+        scans,
         evidence,
         angle: strongest.angle,
         distance: strongest.distance,
