@@ -15,6 +15,8 @@ const BRICK_CELLS: usize = (BRICK * BRICK * BRICK) as usize;
 const EMPTY: u32 = u32::MAX;
 /// A cell knows the nearest point up to this many cells away.
 const REACH: i64 = 3;
+/// Cells along an axis that know a point.
+const WIDTH: usize = 2 * REACH as usize + 1;
 /// Top-level bricks at most, so that a stray point far away cannot make the table huge (16 MiB of it), and that the number of a
 /// brick and that of a cell in it fit into one word.
 const MAX_BRICKS: usize = 1 << 22;
@@ -99,33 +101,45 @@ impl NearestGrid {
         }
     }
 
-    /// Offers a point to all cells in reach of its own.
+    /// Offers a point to all cells in reach of its own: rows of them along z, as they lie in the bricks, without a branch for each.
     fn spread(&mut self, index: u32, cell: [i64; 3], point: &Point, distances: &mut Vec<f32>) {
-        const WIDTH: usize = 2 * REACH as usize + 1;
         let [_, ny, nz] = self.bricks;
-        let strides = [(ny * nz, 2 * BRICK_BITS), (nz, BRICK_BITS), (1, 0)];
-        let [along_x, along_y, along_z]: [[Step; WIDTH]; 3] = std::array::from_fn(|k| {
-            std::array::from_fn(|i| {
-                let cell = cell[k] - REACH + i as i64;
-                let offset = cell - self.low[k];
-                let d = (cell as f32 + 0.5) * self.size - point[k];
-                let (brick, inner) = (offset / BRICK * strides[k].0, (offset % BRICK) << strides[k].1);
-                Step { brick: brick as usize, inner: inner as usize, square: d * d }
-            })
-        });
+        let along_x = self.steps(0, ny * nz, 2 * BRICK_BITS, cell, point);
+        let along_y = self.steps(1, nz, BRICK_BITS, cell, point);
+        let along_z = self.steps(2, 1, 0, cell, point);
+        // The reach is less than a brick, so it is in one brick along z or in two.
+        let bricks = [along_z[0].brick, along_z[WIDTH - 1].brick];
+        let mut rows = [[f32::INFINITY; BRICK as usize]; 2];
+        for step in &along_z {
+            rows[usize::from(step.brick != bricks[0])][step.inner] = step.square;
+        }
+        let rows = &rows[..if bricks[0] == bricks[1] { 1 } else { 2 }];
         for x in &along_x {
             for y in &along_y {
                 let square = x.square + y.square;
-                for z in &along_z {
-                    let first = self.first_cell(x.brick + y.brick + z.brick, distances);
-                    let slot = first + (x.inner | y.inner | z.inner);
-                    if square + z.square < distances[slot] {
-                        distances[slot] = square + z.square;
-                        self.cells[slot] = index;
+                for (row, brick) in rows.iter().zip(bricks) {
+                    let first = self.first_cell(x.brick + y.brick + brick, distances) + (x.inner | y.inner);
+                    let cells = &mut self.cells[first..first + row.len()];
+                    let distances = &mut distances[first..first + row.len()];
+                    for ((along, cell), distance) in row.iter().zip(cells).zip(distances) {
+                        let nearer = square + along < *distance;
+                        *cell = if nearer { index } else { *cell };
+                        *distance = if nearer { square + along } else { *distance };
                     }
                 }
             }
         }
+    }
+
+    /// The cells in reach of `cell` along axis `k`, where a step of a brick is `stride` bricks and cells lie `1 << shift` apart.
+    fn steps(&self, k: usize, stride: i64, shift: u32, cell: [i64; 3], point: &Point) -> [Step; WIDTH] {
+        std::array::from_fn(|i| {
+            let cell = cell[k] - REACH + i as i64;
+            let offset = cell - self.low[k];
+            let d = (cell as f32 + 0.5) * self.size - point[k];
+            let (brick, inner) = (offset / BRICK * stride, (offset % BRICK) << shift);
+            Step { brick: brick as usize, inner: inner as usize, square: d * d }
+        })
     }
 
     /// Where the cells of a brick start, which is made if need be.
@@ -244,6 +258,30 @@ mod tests {
         for (query, found) in queries.iter().zip(found) {
             let found = Some(found as usize).filter(|i| *i < points.len());
             assert_eq!(found, grid.nearest(query));
+        }
+    }
+
+    #[test]
+    fn each_cell_knows_the_nearest_of_the_points_in_reach() {
+        let points: Vec<Point> = (0..300)
+            .map(|i| {
+                [(37, 101, -1.5), (53, 97, 0.2), (71, 89, -1.4)]
+                    .map(|(a, b, from)| (i * a % b) as f32 * 0.031 + from)
+            })
+            .collect();
+        let grid = NearestGrid::new(&points, 0.1);
+        for i in 0..2000 {
+            let cell =
+                [(17, 41, -20), (23, 43, -5), (29, 47, -20)].map(|(a, b, from)| i64::from(i * a % b + from));
+            let centre = cell.map(|c| (c as f32 + 0.5) * 0.1);
+            let in_reach = |p: &Point| {
+                let other = cell_of(p, 0.1);
+                (0..3).all(|k| (other[k] - cell[k]).abs() <= REACH)
+            };
+            let nearest =
+                points.iter().filter(|p| in_reach(p)).map(|p| distance(p, &centre)).min_by(f32::total_cmp);
+            let found = grid.nearest(&centre).map(|index| distance(&points[index], &centre));
+            assert_eq!(found, nearest);
         }
     }
 

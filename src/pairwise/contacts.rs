@@ -11,6 +11,9 @@ use crate::geometry::{Point, Pose};
 /// Points of a block. Its arrays stay in the first-level cache.
 pub(super) const BLOCK: usize = 256;
 
+/// The arithmetic goes over this many points at once; `len` is filled up to a multiple of it.
+pub(super) const LANES: usize = 16;
+
 /// One number a point of the block.
 pub(super) type Numbers = [f32; BLOCK];
 
@@ -32,7 +35,7 @@ impl Motion {
 }
 
 /// A block of points of one scan, carried into the frame of another. Beyond `len` the arrays hold nothing of meaning, except that
-/// `square` is infinite there.
+/// `square` is infinite there up to the next multiple of [`LANES`].
 pub(super) struct Contacts {
     /// Points of the block in use.
     pub len: usize,
@@ -64,6 +67,11 @@ impl Contacts {
         }
     }
 
+    /// `len`, filled up to a multiple of [`LANES`].
+    pub fn lanes(&self) -> usize {
+        self.len.next_multiple_of(LANES).min(BLOCK)
+    }
+
     /// Fills the block with the next points of `other`, every `stride`-th from `first`, at most [`BLOCK`], and gives the first
     /// that has to follow; `None` when there are no more.
     pub fn fill(
@@ -89,8 +97,8 @@ impl Contacts {
         if self.len == 0 {
             return None;
         }
-        carry(&mut self.point, &mut self.normal, motion);
-        let used = self.len;
+        let (used, lanes) = (self.len, self.lanes());
+        carry(&mut self.point, &mut self.normal, motion, lanes);
         let [x, y, z] = &self.point;
         scan.grid.nearest_of_all([&x[..used], &y[..used], &z[..used]], &mut self.found[..used]);
         for (i, found) in self.found[..used].iter_mut().enumerate() {
@@ -101,16 +109,19 @@ impl Contacts {
                 self.surface[k][i] = normal[k];
             }
         }
-        self.found[used..].fill(u32::MAX);
-        part(&self.point, &mut self.offset, &mut self.square, &self.found, last as u32);
+        self.found[used..lanes].fill(u32::MAX);
+        part(&self.point, &mut self.offset, &mut self.square, &self.found[..lanes], last as u32);
         Some(first + BLOCK * stride)
     }
 }
 
+/// Carries the first points and their normals.
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
-fn carry([x, y, z]: &mut [Numbers; 3], [nx, ny, nz]: &mut [Numbers; 3], motion: &Motion) {
+fn carry(point: &mut [Numbers; 3], normal: &mut [Numbers; 3], motion: &Motion, count: usize) {
     let Motion { rotation: r, translation: t } = motion;
-    for i in 0..BLOCK {
+    let [x, y, z] = point.each_mut().map(|axis| &mut axis[..count]);
+    let [nx, ny, nz] = normal.each_mut().map(|axis| &mut axis[..count]);
+    for i in 0..count {
         let (px, py, pz) = (x[i], y[i], z[i]);
         x[i] = r[0][0] * px + r[0][1] * py + r[0][2] * pz + t[0];
         y[i] = r[1][0] * px + r[1][1] * py + r[1][2] * pz + t[1];
@@ -122,20 +133,17 @@ fn carry([x, y, z]: &mut [Numbers; 3], [nx, ny, nz]: &mut [Numbers; 3], motion: 
     }
 }
 
-/// Turns targets into offsets, with their squares.
+/// Turns targets into offsets, with their squares, as far as `found` goes.
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
-fn part(
-    [x, y, z]: &[Numbers; 3],
-    [dx, dy, dz]: &mut [Numbers; 3],
-    square: &mut Numbers,
-    found: &[u32; BLOCK],
-    last: u32,
-) {
-    for i in 0..BLOCK {
-        dx[i] = x[i] - dx[i];
-        dy[i] = y[i] - dy[i];
-        dz[i] = z[i] - dz[i];
-        let apart = dx[i] * dx[i] + dy[i] * dy[i] + dz[i] * dz[i];
+fn part(point: &[Numbers; 3], offset: &mut [Numbers; 3], square: &mut Numbers, found: &[u32], last: u32) {
+    let n = found.len();
+    let [x, y, z] = point.each_ref().map(|axis| &axis[..n]);
+    let [dx, dy, dz] = offset.each_mut().map(|axis| &mut axis[..n]);
+    let square = &mut square[..n];
+    for i in 0..n {
+        let d = [x[i] - dx[i], y[i] - dy[i], z[i] - dz[i]];
+        let apart = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
         square[i] = if found[i] <= last { apart } else { f32::INFINITY };
+        (dx[i], dy[i], dz[i]) = (d[0], d[1], d[2]);
     }
 }

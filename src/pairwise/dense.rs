@@ -4,7 +4,7 @@
 use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
-use super::contacts::{BLOCK, Contacts, Motion};
+use super::contacts::{BLOCK, Contacts, LANES, Motion};
 use crate::features::Scan;
 use crate::geometry::Pose;
 
@@ -126,11 +126,10 @@ fn on_surface(block: &Contacts, near: &Near) -> Counts {
 
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
 fn count(block: &Contacts, near: &Near, counts: &mut Counts) {
-    const LANES: usize = 16;
     let ([nx, ny, nz], [sx, sy, sz], [dx, dy, dz]) = (&block.normal, &block.surface, &block.offset);
     let (mut inliers, mut tight, mut wrong) = ([0_u32; LANES], [0_u32; LANES], [0_u32; LANES]);
     let mut plane = [0.0_f32; LANES];
-    for first in (0..BLOCK).step_by(LANES) {
+    for first in (0..block.lanes()).step_by(LANES) {
         for lane in 0..LANES {
             let i = first + lane;
             let agreement = sx[i] * nx[i] + sy[i] * ny[i] + sz[i] * nz[i];

@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 use nalgebra::{Matrix6, Vector3, Vector6};
 
-use super::contacts::{BLOCK, Contacts, Motion, Numbers};
+use super::contacts::{Contacts, LANES, Motion, Numbers};
 use crate::features::Scan;
 use crate::geometry::Pose;
 
@@ -101,9 +101,8 @@ struct Limits {
 
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
 fn accumulate(block: &Contacts, limits: &Limits, sums: &mut [f64; SUMS]) {
-    const LANES: usize = 16;
     let mut parts = [[0.0_f32; LANES]; SUMS];
-    for first in (0..BLOCK).step_by(LANES) {
+    for first in (0..block.lanes()).step_by(LANES) {
         let lanes = |of: &Numbers| -> [f32; LANES] { std::array::from_fn(|lane| of[first + lane]) };
         let [nx, ny, nz] = block.surface.each_ref().map(lanes);
         let [mx, my, mz] = block.normal.each_ref().map(lanes);
