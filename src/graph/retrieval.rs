@@ -165,15 +165,15 @@ mod tests {
         }
         let ranked = Retrieval::new(&graph).ranked_all(graph.scans().map(|s| s.key()));
         let overlap = |x: ScanKey, y: ScanKey| overlaps[x.0 as usize][y.0 as usize];
-        let mean = |part: &dyn Fn(&[(ScanKey, f32)]) -> Vec<ScanKey>| {
+        let mean = |part: fn(&[(ScanKey, f32)]) -> Vec<ScanKey>| {
             let all: Vec<f64> = ranked
                 .iter()
                 .flat_map(|(x, others)| part(others).into_iter().map(|y| overlap(*x, y)))
                 .collect();
             all.iter().sum::<f64>() / all.len() as f64
         };
-        let first = mean(&|others| others[..3].iter().map(|o| o.0).collect());
-        let last = mean(&|others| others[8..].iter().map(|o| o.0).collect());
+        let first = mean(|others| others[..3].iter().map(|o| o.0).collect());
+        let last = mean(|others| others[8..].iter().map(|o| o.0).collect());
         assert!(ranked.values().all(|others| others.len() == 11));
         assert!(first > 2.0 * last, "the first three overlap by {first:.2}, the last three by {last:.2}");
         let pairs = retrieve(&Retrieval::new(&graph), [ScanKey(4)], 3);
