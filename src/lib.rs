@@ -1,7 +1,7 @@
 //! Cairn fits many 3-D scans of one place into one model.
 //!
 //! The crate is built in layers that point downwards only (a test reads the `crate::` paths and fails on a
-//! wrong edge). The **core**, from [`control`] to [`simulate`], is a function of its inputs: no async runtime, socket,
+//! wrong edge). The **core**, from [`control`] to [`calibrate`], is a function of its inputs: no async runtime, socket,
 //! database, file, clock or global random source. The **service**, from [`project`] up, keeps projects of scans
 //! on disk, runs the core on them in jobs, and answers HTTP. `ARCHITECTURE.md` tells how the two meet.
 
@@ -27,6 +27,8 @@ pub mod baseline;
 
 pub mod evaluate;
 pub mod simulate;
+
+pub mod calibrate;
 
 pub mod project;
 

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use cairn::cli::{bench, demo, evaluate, openapi, register, serve, simulate};
+use cairn::cli::{bench, calibrate, demo, evaluate, openapi, register, serve, simulate};
 
 /// Fits many 3-D scans of one place into one model
 #[derive(Debug, Parser)]
@@ -22,6 +22,7 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     Bench(bench::BenchArgs),
     Simulate(simulate::SimulateArgs),
+    Calibrate(calibrate::CalibrateArgs),
     Openapi(openapi::OpenapiArgs),
 }
 
@@ -40,6 +41,7 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Evaluate(args) => evaluate::run(&args)?,
         Command::Bench(args) => return bench::run(&args),
         Command::Simulate(args) => simulate::run(&args)?,
+        Command::Calibrate(args) => return calibrate::run(&args),
         Command::Openapi(args) => openapi::run(args)?,
     }
     Ok(ExitCode::SUCCESS)

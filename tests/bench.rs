@@ -105,7 +105,7 @@ fn a_scene_is_measured_with_every_strategy_in_every_form() {
     ]);
     let text = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && text.contains("| incremental | 100.0 % | 0 | 0.0 | 1.0 |"), "{text}");
-    assert!(text.contains(&shipped_verifier().provenance), "{text}");
+    assert!(text.contains(&shipped_verifier().provenance.to_string()), "{text}");
     let text = String::from_utf8(cairn(&["bench", "recall", &scene]).stdout).unwrap();
     assert!(text.contains("6 of 6 right, 0 false merges, 0 waiting, 1 components"), "{text}");
 }

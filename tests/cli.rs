@@ -11,6 +11,7 @@ use std::process::{Command, Output};
 use cairn::cli::simulate::write_survey;
 use cairn::control::Seed;
 use cairn::evaluate::{Estimate, Tolerance, TruthReport, against_truth};
+use cairn::pairwise::Verifier;
 use cairn::simulate::{BuildingOptions, Layout, SurveyOptions, simulate};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -255,4 +256,60 @@ fn raw_depth_frames_register_whole() {
 fn a_statue_registers_whole_without_a_flag() {
     let Some(data) = real_data() else { return };
     assert_registers_whole(&data.join("object/dragon_stand"), 0.02);
+}
+
+#[test]
+fn calibration_gives_the_same_weights_at_any_number_of_threads_and_names_no_path() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("my-rooms");
+    survey(&scene, Layout::Office, 3, 6);
+    let run = |threads: &str| {
+        let out = folder.path().join(threads);
+        fs::create_dir(&out).unwrap();
+        let file = |name: &str| out.join(name).into_os_string();
+        let place = format!("home={}", scene.display());
+        let words = ["calibrate", "--simulated", "house-panoramic,hall-panoramic", "--stations", "6", &place];
+        let more = ["--leave-one-out", "--threads", threads, "--quiet", "--json"];
+        let mut args: Vec<std::ffi::OsString> = words.iter().chain(&more).map(Into::into).collect();
+        args.extend(["--out".into(), file("all.json"), "--out-dir".into(), out.clone().into_os_string()]);
+        args.extend(["--diagram".into(), file("diagram.svg")]);
+        let output = cairn(args);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        (out, output.stdout)
+    };
+    let ((one, report), (two, again)) = (run("1"), run("2"));
+    assert_eq!(report, again);
+    assert_eq!(
+        files(&one).iter().map(|path| name(path)).collect::<Vec<_>>(),
+        ["all.json", "diagram.svg", "simulated-only.json", "without-home.json"]
+    );
+    for path in files(&one) {
+        assert_eq!(fs::read(&path).unwrap(), fs::read(two.join(name(&path))).unwrap());
+    }
+    let text = fs::read_to_string(one.join("all.json")).unwrap();
+    assert!(!text.contains(folder.path().to_str().unwrap()), "the path of this machine is in the weights");
+    let verifier = Verifier::parse(&text).unwrap();
+    assert_eq!(
+        verifier.provenance.command,
+        "cairn calibrate --simulated house-panoramic,hall-panoramic --seed 7 --stations 6 home=my-rooms"
+    );
+    let scenes: Vec<&str> = verifier.provenance.scenes.iter().map(|scene| scene.name.as_str()).collect();
+    assert_eq!(scenes, ["my-rooms", "house-panoramic", "hall-panoramic"]);
+    assert!(verifier.provenance.scenes.iter().all(|scene| scene.right > 0 && scene.wrong > 0));
+    let without = Verifier::parse(&fs::read_to_string(one.join("without-home.json")).unwrap()).unwrap();
+    assert!(without.provenance.scenes.iter().all(|scene| scene.name != "my-rooms"));
+    let report: Value = serde_json::from_slice(&report).unwrap();
+    assert!(report["reliability"]["error"].as_f64().unwrap() < 0.3);
+}
+
+#[test]
+fn calibration_says_what_a_folder_lacks() {
+    let folder = tempfile::tempdir().unwrap();
+    survey(folder.path(), Layout::Office, 3, 2);
+    fs::remove_file(folder.path().join("poses.json")).unwrap();
+    let scene = folder.path().to_str().unwrap();
+    let output = cairn(["calibrate", "--simulated", "none", scene, "--out", "weights.json", "--quiet"]);
+    assert_eq!(output.status.code(), Some(1));
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(error.contains("holds no truth: neither poses.json nor"), "{error}");
 }

@@ -17,6 +17,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("baseline", &["geometry", "cloud", "features", "pairwise", "graph", "optimize"]),
     ("evaluate", &["geometry", "cloud"]),
     ("simulate", &["geometry", "cloud"]),
+    ("calibrate", &["geometry", "cloud", "features", "pairwise", "graph", "simulate"]),
     ("project", &["geometry"]),
     ("storage", &["geometry", "project"]),
     (
@@ -34,8 +35,18 @@ const ALLOWED: &[(&str, &[&str])] = &[
 const SERVICE_CRATES: &[&str] =
     &["tokio", "axum", "sqlx", "reqwest", "tower", "std::fs", "std::net", "SystemTime"];
 const CORE: &[&str] = &[
-    "control", "geometry", "cloud", "features", "pairwise", "graph", "optimize", "mapping", "baseline",
-    "evaluate", "simulate",
+    "control",
+    "geometry",
+    "cloud",
+    "features",
+    "pairwise",
+    "graph",
+    "optimize",
+    "mapping",
+    "baseline",
+    "evaluate",
+    "simulate",
+    "calibrate",
 ];
 
 fn sources(folder: &Path, found: &mut Vec<PathBuf>) {

@@ -1,6 +1,7 @@
 //! The command line: one file or folder a subcommand.
 
 pub mod bench;
+pub mod calibrate;
 pub mod demo;
 pub mod evaluate;
 pub mod openapi;

@@ -14,4 +14,4 @@ pub use ecdf::{Ecdf, EcdfStep, ROTATION_STEPS_DEG, TRANSLATION_STEPS_M, ecdf};
 pub use edges::{ClaimedEdge, EdgeFigures, edge_figures};
 pub use estimate::{Estimate, EstimateError, PlacedScan};
 pub use overlap::{Overlap, SurfaceAtTruth, overlaps};
-pub use recall::{Recall, RecallError, recall};
+pub use recall::{Recall, RecallError, benchmark_index, recall};

@@ -109,7 +109,9 @@ pub fn recall(
 }
 
 /// The number behind `cloud_bin_` in a name.
-fn benchmark_index(name: &str) -> Option<u32> {
+/// In the names of the 3DMatch benchmark, all that identifies a scan.
+#[must_use]
+pub fn benchmark_index(name: &str) -> Option<u32> {
     name.match_indices("cloud_bin_").find_map(|(at, mark)| {
         let rest = name.get(at + mark.len()..)?;
         let digits = rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len());

@@ -1,7 +1,6 @@
 //! Two scans: matching, consensus, hypotheses, dense and free-space verification, refinement of the pair. Uses `features`;
 //! used by `graph` and `mapping`.
 
-pub mod calibration;
 mod consensus;
 mod contacts;
 mod dense;
@@ -22,5 +21,6 @@ pub use planar::planar_poses;
 pub use probe::{Probe, probe};
 pub use shortlist::shortlist;
 pub use verifier::{
-    Evidence, FEATURES, Logistic, TRIPLET_FEATURES, Verifier, VerifierError, shipped_verifier,
+    Evidence, FEATURES, FittedScene, Logistic, Provenance, TRIPLET_FEATURES, Verifier, VerifierError,
+    shipped_verifier,
 };

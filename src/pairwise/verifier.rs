@@ -1,8 +1,9 @@
 //! How likely a pose of two scans is right: a logistic regression with quadratic terms on dense, free-space and match evidence.
 //!
-//! Its weights are fitted (`calibration`) on scenes with known truth and shipped in `verifier.json`; every feature is
+//! Weights are fitted by `cairn calibrate` on scenes with known truth; some are shipped in `verifier.json`; every feature is
 //! free of units (counts, shares, or lengths in voxels).
 
+use std::fmt;
 use std::sync::{Arc, LazyLock};
 
 use serde::{Deserialize, Serialize};
@@ -111,11 +112,52 @@ impl Logistic {
     }
 }
 
+/// How weights were made: enough to make them again.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Name and version of the program.
+    pub program: String,
+    /// Its command line, with the names of folders for their paths; for weights that no command made, what they were fitted on.
+    pub command: String,
+    /// What the weights were fitted on.
+    pub scenes: Vec<FittedScene>,
+}
+
+impl fmt::Display for Provenance {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.scenes.is_empty() {
+            return f.write_str(&self.command);
+        }
+        let simulated = self.scenes.iter().filter(|scene| !scene.seeds.is_empty()).count();
+        let real = self.scenes.len() - simulated;
+        write!(f, "{}, on {real} real and {simulated} simulated scenes: `{}`", self.program, self.command)
+    }
+}
+
+/// A scene that weights were fitted on.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FittedScene {
+    /// The folder of a real scene, or the kind of a simulated one.
+    pub name: String,
+    /// Seeds of the surveys that were simulated; none for real scans.
+    pub seeds: Vec<u64>,
+    /// Scans in it.
+    pub scans: usize,
+    /// Pairs of them that were matched.
+    pub pairs: usize,
+    /// Hypotheses that are right.
+    pub right: usize,
+    /// Hypotheses that are wrong.
+    pub wrong: usize,
+    /// Hypotheses that nothing was learned from.
+    pub left_out: usize,
+}
+
 /// The two regressions that judge poses. The engine takes one as an argument; by default the shipped one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Verifier {
-    /// What the weights were fitted on.
-    pub provenance: String,
+    /// How the weights were made.
+    pub provenance: Provenance,
     /// On a pair alone.
     pub pair: Logistic,
     /// On a pair and what third scans say.

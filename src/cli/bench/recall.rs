@@ -152,7 +152,7 @@ fn report(args: &RecallArgs, verifiers: &[Arc<Verifier>], cancel: &CancelToken) 
         }
         scenes.push(SceneReport {
             name: scene.name.clone(),
-            verifier: verifier.provenance.clone(),
+            verifier: verifier.provenance.to_string(),
             scans: scene.scans.len(),
             places: scene.places(),
             resolution_m: scene.resolution,

@@ -1,0 +1,273 @@
+//! From labelled scenes to the two regressions, and what they say of scenes that they did not see.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::label::Label;
+use super::regression::{Example, fit};
+use super::scene::{MatchedScene, ScanOutline};
+use super::view::View;
+use crate::control::{Cancelled, Control, Stage};
+use crate::features::{PreparedScan, Scan};
+use crate::graph::{ScanGraph, SupportOptions, triplet_features};
+use crate::pairwise::{Evidence, Logistic, PairResult, Verifier};
+
+/// Places are dealt to so many folds; each is predicted by a fit on the others.
+const FOLDS: usize = 5;
+/// Views whose graphs teach the second regression.
+const GRAPH_VIEWS: [View; 2] = [View::Full, View::Blind];
+
+/// Why no weights can be fitted.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum FitError {
+    /// Predictions need places that the fit did not see.
+    #[error("a fit needs scenes of at least two places, not {0}")]
+    Places(usize),
+    /// Without both, nothing tells them apart.
+    #[error("the scenes other than {without:?} hold no right or no wrong hypotheses")]
+    OneLabel {
+        /// Scenes that were held out.
+        without: Vec<String>,
+    },
+    /// Stopped by the caller.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
+}
+
+/// What a verifier says of one labelled hypothesis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Prediction {
+    /// Index of the scene in the list that was given.
+    pub scene: usize,
+    /// How it was seen.
+    pub view: View,
+    /// Whether the pose is right.
+    pub right: bool,
+    /// Log-odds from the pair alone.
+    pub pair_logit: f64,
+    /// Log-odds with triplets.
+    pub logit: f64,
+}
+
+/// Fitted regressions.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    /// On a pair alone.
+    pub pair: Logistic,
+    /// On a pair and what third scans say.
+    pub triplet: Logistic,
+    /// Of every labelled hypothesis, by regressions that saw no scene of its place.
+    pub held_out: Vec<Prediction>,
+}
+
+impl Fit {
+    /// Fits both regressions. The second learns from log-odds of the first that are out of fold: of scenes that it was fitted on
+    /// they would be too good, and the second would trust it too much.
+    pub fn of(scenes: &[&MatchedScene], control: Control<'_>) -> Result<Self, FitError> {
+        let folds = folds(scenes)?;
+        let examples: Vec<Vec<Example>> = scenes.iter().map(|scene| pair_examples(scene)).collect();
+        let steps = 2 * folds.len() + 2;
+        let step = |done| -> Result<(), Cancelled> {
+            control.report(Stage::Support, done, steps);
+            control.check()
+        };
+        let names = |fold: &[usize]| fold.iter().map(|s| scenes[*s].name.clone()).collect();
+        let without = |fold: &[usize], examples: &[Vec<Example>]| {
+            let pooled =
+                pooled(examples.iter().enumerate().filter(|(s, _)| !fold.contains(s)).map(|(_, e)| e));
+            fit(&pooled).ok_or_else(|| FitError::OneLabel { without: names(fold) })
+        };
+        let mut judged: Vec<Vec<Judged>> = vec![Vec::new(); scenes.len()];
+        for (done, fold) in folds.iter().enumerate() {
+            step(done)?;
+            let pair = without(fold, &examples)?;
+            let fresh: Vec<Vec<Judged>> = fold.par_iter().map(|s| hypotheses(scenes[*s], &pair)).collect();
+            for (s, fresh) in fold.iter().zip(fresh) {
+                judged[*s] = fresh;
+            }
+        }
+        step(folds.len())?;
+        let pair = without(&[], &examples)?;
+        let examples: Vec<Vec<Example>> = judged.iter().map(|judged| triplet_examples(judged)).collect();
+        let mut held_out = Vec::new();
+        for (done, fold) in folds.iter().enumerate() {
+            step(folds.len() + 1 + done)?;
+            let triplet = without(fold, &examples)?;
+            held_out.extend(fold.iter().flat_map(|s| predictions(*s, &judged[*s], &triplet)));
+        }
+        held_out.sort_by_key(|p| p.scene);
+        let triplet = without(&[], &examples)?;
+        step(steps)?;
+        Ok(Self { pair, triplet, held_out })
+    }
+}
+
+/// What a verifier says of the labelled hypotheses of a scene; `scene` is noted in each prediction.
+#[must_use]
+pub fn judge(verifier: &Verifier, scene: usize, of: &MatchedScene) -> Vec<Prediction> {
+    predictions(scene, &hypotheses(of, &verifier.pair), &verifier.triplet)
+}
+
+/// Scenes by fold, dealt so that real and simulated ones spread evenly; a place is in one fold only.
+fn folds(scenes: &[&MatchedScene]) -> Result<Vec<Vec<usize>>, FitError> {
+    let mut places: Vec<(bool, &str)> = Vec::new();
+    for scene in scenes {
+        let place = (scene.is_simulated(), scene.place.as_str());
+        if !places.contains(&place) {
+            places.push(place);
+        }
+    }
+    if places.len() < 2 {
+        return Err(FitError::Places(places.len()));
+    }
+    // Stable: real places first, each kind in the order given.
+    places.sort_by_key(|(simulated, _)| *simulated);
+    let mut folds = vec![Vec::new(); FOLDS.min(places.len())];
+    let count = folds.len();
+    for (s, scene) in scenes.iter().enumerate() {
+        let rank = places.iter().position(|place| *place == (scene.is_simulated(), scene.place.as_str()));
+        folds[rank.unwrap_or_default() % count].push(s);
+    }
+    Ok(folds)
+}
+
+/// Labelled evidence of one scene in all views, weighted by [`share_out`].
+fn pair_examples(scene: &MatchedScene) -> Vec<Example> {
+    let mut examples = Vec::new();
+    for view in View::ALL {
+        let evidence = scene.pairs.iter().flat_map(|pair| pair.result.hypotheses.iter().zip(&pair.labels));
+        let seen = evidence.filter_map(|(hypothesis, label)| {
+            let evidence = view.of(&hypothesis.evidence)?;
+            let features = evidence.features(scene.resolution).to_vec();
+            Some(Example { features, right: label.is_right()?, weight: view.weight() })
+        });
+        examples.extend(seen);
+    }
+    share_out(&mut examples);
+    examples
+}
+
+/// Examples for the second regression, weighted by [`share_out`].
+fn triplet_examples(judged: &[Judged]) -> Vec<Example> {
+    let mut examples: Vec<Example> = judged
+        .iter()
+        .map(|j| Example { features: j.features.clone(), right: j.right, weight: j.view.weight() })
+        .collect();
+    share_out(&mut examples);
+    examples
+}
+
+/// Scales the weights of a scene so that they sum to the root of the number of its examples: scenes that count alike would let a
+/// hall of twelve scans say as much as sixty fragments, and examples that count alike would let one scene say most.
+fn share_out(examples: &mut [Example]) {
+    let total: f64 = examples.iter().map(|e| e.weight).sum();
+    let scale = (examples.len() as f64).sqrt() / total;
+    for example in examples {
+        example.weight *= scale;
+    }
+}
+
+/// All examples together, their weights scaled to a mean of 1.
+fn pooled<'e>(scenes: impl Iterator<Item = &'e Vec<Example>>) -> Vec<Example> {
+    let mut all: Vec<Example> = scenes.flatten().cloned().collect();
+    let mean = all.iter().map(|e| e.weight).sum::<f64>() / all.len().max(1) as f64;
+    for example in &mut all {
+        example.weight /= mean;
+    }
+    all
+}
+
+/// A labelled hypothesis within its scan graph.
+#[derive(Debug, Clone)]
+struct Judged {
+    view: View,
+    right: bool,
+    /// Of the second regression; the first of them is the pair's log-odds.
+    features: Vec<f64>,
+}
+
+fn predictions(scene: usize, judged: &[Judged], triplet: &Logistic) -> Vec<Prediction> {
+    let of = |j: &Judged| Prediction {
+        scene,
+        view: j.view,
+        right: j.right,
+        pair_logit: j.features[0],
+        logit: triplet.logit(&j.features),
+    };
+    judged.iter().map(of).collect()
+}
+
+/// Builds the scan graph of a scene in each view and takes the features of every labelled hypothesis.
+fn hypotheses(scene: &MatchedScene, pair: &Logistic) -> Vec<Judged> {
+    let options = SupportOptions::default();
+    let mut judged = Vec::new();
+    for view in GRAPH_VIEWS {
+        let differs = |evidence: &Evidence| view.of(evidence).is_some();
+        if !scene.pairs.iter().flat_map(|p| &p.result.hypotheses).any(|h| differs(&h.evidence)) {
+            continue;
+        }
+        let mut graph = ScanGraph::new();
+        for scan in &scene.scans {
+            graph.add_scan(Arc::new(outline(scan, scene.resolution)));
+        }
+        graph
+            .add_results(scene.pairs.iter().map(|p| seen(&p.result, view, pair, scene.resolution)), &options);
+        for matched in &scene.pairs {
+            let Some(edge) = graph.edge(matched.result.pair.a, matched.result.pair.b) else { continue };
+            let features = triplet_features(&graph, edge, &options);
+            // The graph sorts hypotheses by their scores.
+            for (supported, features) in edge.hypotheses.iter().zip(features) {
+                let pose = &supported.hypothesis.a_from_b;
+                let found = matched.result.hypotheses.iter().position(|h| h.a_from_b == *pose);
+                let label = found.and_then(|h| matched.labels.get(h)).and_then(|label| label.is_right());
+                if let Some(right) = label
+                    && differs(&supported.hypothesis.evidence)
+                {
+                    judged.push(Judged { view, right, features: features.to_vec() });
+                }
+            }
+        }
+    }
+    judged
+}
+
+/// A pair's result as this view and regression have it.
+fn seen(result: &PairResult, view: View, pair: &Logistic, voxel: f64) -> PairResult {
+    let mut result = PairResult { matches: Vec::new(), ..result.clone() };
+    for hypothesis in &mut result.hypotheses {
+        let evidence = view.of(&hypothesis.evidence).unwrap_or(hypothesis.evidence);
+        hypothesis.logit = pair.logit(&evidence.features(voxel));
+    }
+    result.hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));
+    result
+}
+
+/// As much of a scan as the scan graph reads.
+fn outline(scan: &ScanOutline, resolution: f64) -> Scan {
+    let prepared = PreparedScan {
+        key: scan.key,
+        resolution,
+        origin: [0.0; 3],
+        points: Vec::new(),
+        normals: Vec::new(),
+        keypoints: Vec::new(),
+        descriptors: Vec::new(),
+        signature: Vec::new(),
+        range_image: None,
+        viewpoint: [0.0; 3],
+        hidden_share: 0.0,
+    };
+    Scan { centroid: scan.centroid.into(), ..Scan::new(prepared) }
+}
+
+impl Label {
+    /// Whether it is right, if anything is to be learned from it.
+    fn is_right(self) -> Option<bool> {
+        match self {
+            Self::Right => Some(true),
+            Self::Wrong => Some(false),
+            Self::LeftOut(_) => None,
+        }
+    }
+}
