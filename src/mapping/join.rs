@@ -11,9 +11,13 @@ use super::options::{JoinLevel, MappingOptions};
 use super::surfaces::{align, judge, judge_inside};
 use crate::geometry::{Kernel, Pose, rigid_fit};
 use crate::graph::ScanGraph;
-use crate::pairwise::inlier_matches;
+use crate::pairwise::{Counts, inlier_matches};
 
 const FIT_ITERATIONS: usize = 5;
+/// Firm support allows this many times the usual violation, at most.
+const FIRM_LENIENCE: f64 = 1.5;
+/// Of the points that are near the other side, at most this share may face another way. Right joins of components show up to 0.3.
+const MAX_WRONG_NORMAL: f64 = 0.38;
 /// Edges whose own poses are tried where the fit to all of them fails.
 const SINGLE_STARTS: usize = 6;
 
@@ -74,7 +78,7 @@ pub fn allowed_violation(
 ) -> f64 {
     let inside = judge_inside(graph, a).plus(&judge_inside(graph, b)).violation_share();
     let usual = options.violation_contrast * inside + options.violation_floor;
-    level.violation.min(usual * (support / options.firm_support).max(1.0))
+    level.violation.min(usual * (support / options.firm_support).clamp(1.0, FIRM_LENIENCE))
 }
 
 /// Weighs the candidates of two components against each other, best supported first (`candidates`, in that order): the first that keeps
@@ -120,6 +124,13 @@ pub fn weigh_join(
     Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support }))
 }
 
+/// The share of judged points that speak against a pose: in free space, or all of them where surfaces cross instead of coinciding,
+/// which is no overlap, however clear of free space it is.
+#[must_use]
+pub fn violation_of(counts: &Counts) -> f64 {
+    if counts.wrong_normal_share() > MAX_WRONG_NORMAL { 1.0 } else { counts.violation_share() }
+}
+
 /// Aligns one candidate and checks it alone. Where edges agree only roughly, the fit to all of them can slide into free space while
 /// one of them is right, so the poses of single edges are tried too.
 fn place(
@@ -135,7 +146,8 @@ fn place(
         let a_from_b = align(graph, a, b, start, voxel);
         let support = support_of(graph, a, b, &a_from_b, voxel, options);
         let counts = judge(graph, a, b, &a_from_b);
-        Placed { a_from_b, support, violation: counts.violation_share() }
+        let violation = violation_of(&counts);
+        Placed { a_from_b, support, violation }
     };
     let mut best = settle(&pooled_fit(graph, a, b, candidate, voxel));
     if candidate.decided {

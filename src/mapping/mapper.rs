@@ -6,7 +6,7 @@ use super::candidates::{CLUSTERS, Candidate, best_candidate, candidates, support
 use super::component::Component;
 use super::consistency::{supports, thrown, weakest_cut};
 use super::initial_pair::initial_pairs;
-use super::join::{Refusal, allowed_violation, pooled_fit, weigh_join};
+use super::join::{Refusal, allowed_violation, pooled_fit, violation_of, weigh_join};
 use super::next_scan::visible_landmarks;
 use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
@@ -58,6 +58,8 @@ const MAX_FILTERED: usize = 2;
 const FILTER_FROM: usize = 4;
 /// … and only if another place has this much more support than the one it has.
 const FILTER_MARGIN: f64 = 2.0;
+/// Pieces of at least this many scans are only joined on more support than the most lenient level asks.
+const LARGE_PIECE: usize = 3;
 
 impl Mapper {
     /// Number of registered scans.
@@ -212,6 +214,10 @@ impl Mapper {
         for i in 0..self.components.len() {
             for j in i + 1..self.components.len() {
                 let (a, b) = self.larger_first(i, j);
+                // A wrong join of two large pieces misplaces many scans, and pieces that large have more to say for each other.
+                if self.components[b].len() >= LARGE_PIECE && level.support < options.least_large_support {
+                    continue;
+                }
                 let found =
                     candidates(graph, &self.components[a], &self.components[b], voxel, options, CLUSTERS);
                 match found.first() {
@@ -284,7 +290,7 @@ impl Mapper {
             part
         };
         let (x, y) = (part(a), part(b));
-        let found = judge(graph, &x, &y, &Pose::identity()).violation_share();
+        let found = violation_of(&judge(graph, &x, &y, &Pose::identity()));
         let allowed = allowed_violation(graph, a, b, candidate.support, level, options);
         let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
         Ok((found <= allowed && kept >= level.support).then_some(joined))

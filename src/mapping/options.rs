@@ -35,6 +35,8 @@ pub struct MappingOptions {
     pub levels: Vec<JoinLevel>,
     /// What holds together by less than this is taken apart and decided anew when scans arrive.
     pub firm_support: f64,
+    /// Least support for joining two pieces of several scans each.
+    pub least_large_support: f64,
     /// Share of the runner-up's support taken off a candidate's.
     pub rival_share: f64,
     /// Two components may violate each other's free space by this many times the share by which they violate their own …
@@ -78,6 +80,7 @@ impl Default for MappingOptions {
                 level(1.5, 0.2, 12),
             ],
             firm_support: 4.0,
+            least_large_support: 2.5,
             rival_share: 0.5,
             violation_contrast: 3.0,
             violation_floor: 0.01,

@@ -54,6 +54,12 @@ impl Counts {
         share(self.inliers, self.points)
     }
 
+    /// Points that face another way among those that are near the other's surface.
+    #[must_use]
+    pub fn wrong_normal_share(&self) -> f64 {
+        share(self.wrong_normal, self.wrong_normal + self.inliers)
+    }
+
     /// Violations among the points that can be judged: those on the surface and those in free space.
     #[must_use]
     pub fn violation_share(&self) -> f64 {
