@@ -94,7 +94,7 @@ pub struct PreparedScan {
     pub normals: Vec<Point>,
     /// Indices of the keypoints in `points`, ascending.
     pub keypoints: Vec<u32>,
-    /// Descriptors of the keypoints, one after the other, each [`DESCRIPTOR_LEN`] long.
+    /// Descriptors of the keypoints, one after the other, each [`DESCRIPTOR_LEN`](super::DESCRIPTOR_LEN) long.
     pub descriptors: Vec<f32>,
     /// The global signature.
     pub signature: Vec<f32>,
