@@ -238,7 +238,7 @@ pub struct Testimony {
 }
 
 impl Testimony {
-    /// Whether too much is said against the component for it to be right. Where all is right, chance says at most 0.04 for each
+    /// Whether too much is said against the component for it to be right. Where all is right, chance says at most 0.02 for each
     /// witness; where alike rooms were folded onto each other it is 0.15 and more.
     #[must_use]
     pub fn condemns(&self) -> bool {

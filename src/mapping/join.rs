@@ -1,6 +1,8 @@
 //! One join: a scan into a component, or a component into another. From the candidate pose through a fit to pooled matches and
 //! a dense alignment to the verdict on everything that overlaps.
 
+use std::cell::OnceCell;
+
 use serde::{Deserialize, Serialize};
 
 use nalgebra::Vector3;
@@ -66,19 +68,44 @@ struct Placed {
 
 /// The violation that a join may show: little more than the two sides show within themselves, so that clean data, where wrong joins of
 /// alike rooms stand out, is judged more strictly than noisy data; more where support is firm, since a fit that is a little off
-/// violates a little; and never more than the level says.
-#[must_use]
-pub fn allowed_violation(
-    graph: &ScanGraph,
-    a: &Component,
-    b: &Component,
-    support: f64,
-    level: &JoinLevel,
-    options: &MappingOptions,
-) -> f64 {
-    let inside = judge_inside(graph, a).plus(&judge_inside(graph, b)).violation_share();
-    let usual = options.violation_contrast * inside + options.violation_floor;
-    level.violation.min(usual * (support / options.firm_support).clamp(1.0, FIRM_LENIENCE))
+/// violates a little; and never more than the level says. What the sides show is only counted when that matters.
+pub struct ViolationLimit<'m> {
+    /// Always allowed.
+    least: f64,
+    full: OnceCell<f64>,
+    count: Box<dyn Fn() -> f64 + 'm>,
+}
+
+impl<'m> ViolationLimit<'m> {
+    /// The limit for joining `a` and `b` with this support at this level.
+    #[must_use]
+    pub fn new(
+        graph: &'m ScanGraph,
+        (a, b): (&'m Component, &'m Component),
+        support: f64,
+        level: &JoinLevel,
+        options: &'m MappingOptions,
+    ) -> Self {
+        let most = level.violation;
+        let count = move || {
+            let inside = judge_inside(graph, a).plus(&judge_inside(graph, b)).violation_share();
+            let usual = options.violation_contrast * inside + options.violation_floor;
+            most.min(usual * (support / options.firm_support).clamp(1.0, FIRM_LENIENCE))
+        };
+        Self { least: most.min(options.violation_floor), full: OnceCell::new(), count: Box::new(count) }
+    }
+
+    /// Whether a join may violate free space by this share.
+    #[must_use]
+    pub fn admits(&self, violation: f64) -> bool {
+        violation <= self.least || violation <= self.share()
+    }
+
+    /// The largest share that is allowed.
+    #[must_use]
+    pub fn share(&self) -> f64 {
+        *self.full.get_or_init(&self.count)
+    }
 }
 
 /// Weighs the candidates of two components against each other, best supported first (`candidates`, in that order): the first that keeps
@@ -95,13 +122,15 @@ pub fn weigh_join(
 ) -> Result<Pose, Refusal> {
     let mut first_refusal = None;
     let support = candidates.first().map_or(0.0, |best| best.support);
-    let level = &JoinLevel { violation: allowed_violation(graph, a, b, support, level, options), ..*level };
+    let limit = ViolationLimit::new(graph, (a, b), support, level, options);
+    let place =
+        |candidate: &Candidate, least: f64| place(graph, (a, b), candidate, least, &limit, voxel, options);
     for (rank, candidate) in candidates.iter().enumerate() {
         if candidate.support < level.support {
             let refusal = Refusal::Support { found: candidate.support, needed: level.support };
             return Err(first_refusal.unwrap_or(refusal));
         }
-        match place(graph, a, b, candidate, level, voxel, options) {
+        match place(candidate, level.support) {
             Ok(placed) => {
                 let margin = |rival: f64| placed.support - options.rival_share * rival;
                 // Rivals are looked at only as far as they matter.
@@ -109,10 +138,7 @@ pub fn weigh_join(
                     .iter()
                     .enumerate()
                     .filter(|(other, c)| *other != rank && margin(c.doubt) < level.support)
-                    .find(|(_, c)| {
-                        let lenient = JoinLevel { support: 0.0, ..*level };
-                        place(graph, a, b, c, &lenient, voxel, options).is_ok()
-                    });
+                    .find(|(_, c)| place(c, 0.0).is_ok());
                 return match rival {
                     Some((_, c)) => Err(Refusal::Rival { support: placed.support, rival: c.doubt }),
                     None => Ok(placed.a_from_b),
@@ -131,36 +157,40 @@ pub fn violation_of(counts: &Counts) -> f64 {
     if counts.wrong_normal_share() > MAX_WRONG_NORMAL { 1.0 } else { counts.violation_share() }
 }
 
-/// Aligns one candidate and checks it alone. Where edges agree only roughly, the fit to all of them can slide into free space while
-/// one of them is right, so the poses of single edges are tried too.
+/// Aligns one candidate and checks that it keeps at least `least` support, no ban stands against it, and free space allows it. Where edges
+/// agree only roughly, the fit to all of them can slide into free space while one of them is right, so the poses of single edges are
+/// tried too.
 fn place(
     graph: &ScanGraph,
-    a: &Component,
-    b: &Component,
+    (a, b): (&Component, &Component),
     candidate: &Candidate,
-    level: &JoinLevel,
+    least: f64,
+    limit: &ViolationLimit<'_>,
     voxel: f64,
     options: &MappingOptions,
 ) -> Result<Placed, Refusal> {
     let settle = |start: &Pose| {
         let a_from_b = align(graph, a, b, start, voxel);
-        let support = support_of(graph, a, b, &a_from_b, voxel, options);
-        let counts = judge(graph, a, b, &a_from_b);
-        let violation = violation_of(&counts);
-        Placed { a_from_b, support, violation }
+        // What alignment moved to a banned pose has no support there.
+        let support = if options.decisions.forbids(graph, a, b, &a_from_b, options) {
+            f64::NEG_INFINITY
+        } else {
+            support_of(graph, a, b, &a_from_b, voxel, options)
+        };
+        Placed { a_from_b, support, violation: violation_of(&judge(graph, a, b, &a_from_b)) }
     };
-    let mut best = settle(&pooled_fit(graph, a, b, candidate, voxel));
     if candidate.decided {
-        let agrees = candidate.members.iter().all(|m| near(&best.a_from_b, m, voxel, options));
-        return Ok(Placed { a_from_b: if agrees { best.a_from_b } else { candidate.a_from_b }, ..best });
+        let aligned = align(graph, a, b, &pooled_fit(graph, a, b, candidate, voxel), voxel);
+        let agrees = candidate.members.iter().all(|m| near(&aligned, m, voxel, options));
+        let a_from_b = if agrees { aligned } else { candidate.a_from_b };
+        return Ok(Placed { a_from_b, support: candidate.support, violation: 0.0 });
     }
-    let passes = |p: &Placed| p.support >= level.support && p.violation <= level.violation;
+    let mut best = settle(&pooled_fit(graph, a, b, candidate, voxel));
+    let passes = |p: &Placed| p.support >= least && limit.admits(p.violation);
     if !passes(&best) && candidate.members.len() > 1 {
         for member in candidate.members.iter().take(SINGLE_STARTS) {
             let other = settle(&member.a_from_b);
-            if other.support >= level.support
-                && (other.violation < best.violation || best.support < level.support)
-            {
+            if other.support >= least && (other.violation < best.violation || best.support < least) {
                 best = other;
             }
             if passes(&best) {
@@ -169,11 +199,11 @@ fn place(
         }
     }
     // The alignment must stay at the pose that the edges voted for.
-    if best.support < level.support {
-        return Err(Refusal::Support { found: best.support, needed: level.support });
+    if best.support < least {
+        return Err(Refusal::Support { found: best.support.max(0.0), needed: least });
     }
-    if best.violation > level.violation {
-        return Err(Refusal::Violation { found: best.violation, allowed: level.violation });
+    if !limit.admits(best.violation) {
+        return Err(Refusal::Violation { found: best.violation, allowed: limit.share() });
     }
     Ok(best)
 }

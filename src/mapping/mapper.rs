@@ -2,20 +2,19 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::candidates::{CLUSTERS, Candidate, best_candidate, candidates, support_of};
+use super::bent_join::bent_join;
+use super::candidates::{CLUSTERS, Candidate, candidates};
 use super::component::Component;
 use super::consistency::{supports, thrown, weakest_cut};
 use super::initial_pair::initial_pairs;
-use super::join::{Refusal, allowed_violation, pooled_fit, violation_of, weigh_join};
+use super::join::{Refusal, weigh_join};
 use super::next_scan::visible_landmarks;
 use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{dense, local_bundle_adjustment, neighborhood, pose_graph};
 use super::snapshot::WaitingReason;
-use super::surfaces::judge;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
-use crate::geometry::Pose;
 use crate::graph::{Retrieval, ScanGraph};
 use crate::pairwise::PairKey;
 
@@ -41,7 +40,7 @@ pub struct Mapper {
     /// support changes.
     refused: BTreeMap<(ScanKey, ScanKey), (f64, f64)>,
     /// How often each scan was filtered out, so that filtering ends.
-    filtered: BTreeMap<ScanKey, usize>,
+    pub(super) filtered: BTreeMap<ScanKey, usize>,
     /// Joins since the whole model was refined last.
     pub joins_since_refinement: usize,
     /// Scans of components that were taken apart because their pairs contradict each other.
@@ -52,12 +51,6 @@ pub struct Mapper {
     pub open_joins: Vec<OpenJoin>,
 }
 
-/// A scan is filtered at most this often while the model does not forget.
-const MAX_FILTERED: usize = 2;
-/// A scan is filtered only from components of at least this many scans.
-const FILTER_FROM: usize = 4;
-/// … and only if another place has this much more support than the one it has.
-const FILTER_MARGIN: f64 = 2.0;
 /// Pieces of at least this many scans are only joined on more support than the most lenient level asks.
 const LARGE_PIECE: usize = 3;
 
@@ -79,6 +72,7 @@ impl Mapper {
         self.filtered.remove(&scan);
         self.doubted.remove(&scan);
         self.open_joins.retain(|open| open.a != scan && open.b != scan);
+        self.undone.retain(|undone| !undone.scans.contains(&scan) && !undone.evidence.contains(&scan));
         self.refused.retain(|(x, y), _| *x != scan && *y != scan);
         for component in &mut self.components {
             component.remove(scan, options);
@@ -248,7 +242,7 @@ impl Mapper {
                 Err(refusal) => {
                     if let Refusal::Violation { .. } = refusal
                         && let Some(joined) =
-                            self.bent_join(graph, (a, b), candidate, level, voxel, options, control)?
+                            bent_join(graph, (first, second), candidate, level, voxel, options, control)?
                     {
                         self.components[a] = joined;
                         self.components.remove(b);
@@ -260,72 +254,6 @@ impl Mapper {
             }
         }
         Ok(false)
-    }
-
-    /// A join of two components that are each a little bent, so that no rigid motion fits all that they share: they are joined on
-    /// trial, adjusted together, and judged as they then stand. `None` when that does not help either.
-    #[expect(clippy::too_many_arguments, reason = "the arguments of every step, and which two components")]
-    fn bent_join(
-        &self,
-        graph: &ScanGraph,
-        (a, b): (usize, usize),
-        candidate: &Candidate,
-        level: &JoinLevel,
-        voxel: f64,
-        options: &MappingOptions,
-        control: Control<'_>,
-    ) -> Result<Option<Component>, Cancelled> {
-        let (a, b) = (&self.components[a], &self.components[b]);
-        let mut joined = a.clone();
-        joined.absorb(b.clone(), &pooled_fit(graph, a, b, candidate, voxel), graph, options);
-        let before = joined.clone();
-        pose_graph(graph, &mut joined, voxel, options, control)?;
-        dense(graph, &mut joined, None, voxel, control)?;
-        if !thrown(graph, &before, &joined, options).is_empty() {
-            return Ok(None);
-        }
-        let part = |of: &Component| {
-            let mut part = of.clone();
-            part.poses.retain(|key, pose| joined.poses.get(key).map(|moved| *pose = *moved).is_some());
-            part
-        };
-        let (x, y) = (part(a), part(b));
-        let found = violation_of(&judge(graph, &x, &y, &Pose::identity()));
-        let allowed = allowed_violation(graph, a, b, candidate.support, level, options);
-        let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
-        Ok((found <= allowed && kept >= level.support).then_some(joined))
-    }
-
-    /// Filtering: takes out scans that have clearly more support at another pose than at their own. They wait, and may register
-    /// again. Returns how many.
-    pub fn filter_scans(&mut self, graph: &ScanGraph, voxel: f64, options: &MappingOptions) -> usize {
-        let mut misplaced: Vec<ScanKey> = Vec::new();
-        for component in self.components.iter().filter(|c| c.len() >= FILTER_FROM) {
-            for (scan, pose) in &component.poses {
-                if self.filtered.get(scan).copied().unwrap_or(0) >= MAX_FILTERED {
-                    continue;
-                }
-                let single = Component::single(*scan);
-                let mut rest = component.clone();
-                rest.poses.remove(scan);
-                let Some(best) = best_candidate(graph, &rest, &single, voxel, options) else { continue };
-                let own = support_of(graph, &rest, &single, pose, voxel, options);
-                if best.support > own + FILTER_MARGIN
-                    && differs(&best.a_from_b, pose, *scan, graph, voxel, options)
-                {
-                    misplaced.push(*scan);
-                }
-            }
-        }
-        for scan in &misplaced {
-            *self.filtered.entry(*scan).or_default() += 1;
-            for component in &mut self.components {
-                component.remove(*scan, options);
-            }
-            self.add_waiting(*scan);
-        }
-        self.dissolve_small();
-        misplaced.len()
     }
 
     /// Pairs worth a try for scans and components that stay apart: for every scan outside the largest component, its most similar
@@ -388,6 +316,10 @@ impl Mapper {
         self.filtered.clear();
         self.doubted.clear();
         self.undone.clear();
+        for refusal in self.waiting.values_mut() {
+            // What was taken back then is no verdict on what is decided now.
+            *refusal = refusal.filter(|refusal| !matches!(refusal, Refusal::Contradicted { .. }));
+        }
         self.dissolve_small();
         self.sort_components();
     }
@@ -505,17 +437,4 @@ fn worse(known: Option<Refusal>, new: Refusal) -> Option<Refusal> {
         | (Some(Refusal::Violation { .. } | Refusal::Rival { .. }), Refusal::Support { .. }) => known,
         _ => Some(new),
     }
-}
-
-fn differs(
-    x: &Pose,
-    y: &Pose,
-    scan: ScanKey,
-    graph: &ScanGraph,
-    voxel: f64,
-    options: &MappingOptions,
-) -> bool {
-    let Some(scan) = graph.scan(scan) else { return false };
-    let (angle, distance) = crate::pairwise::centred_difference(x, y, &scan.centroid);
-    angle > options.rival_angle || distance > options.rival_voxels * voxel
 }

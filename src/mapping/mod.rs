@@ -6,10 +6,12 @@
 //! continue, are created and merge, with closed-form and robust aggregation; `refine` is local and global bundle adjustment, pose graph
 //! and joint dense adjustment; `track_refinement` moves keypoints; `mapper` has one method a step and `policy` their order.
 
+mod bent_join;
 mod candidates;
 mod component;
 mod consistency;
 mod decision;
+mod filter;
 mod initial_pair;
 mod join;
 mod live_model;

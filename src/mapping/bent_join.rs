@@ -1,0 +1,47 @@
+//! Joining two pieces that are each a little bent: the last resort where no rigid motion fits. Used by `mapper`.
+
+use super::candidates::{Candidate, support_of};
+use super::component::Component;
+use super::consistency::thrown;
+use super::join::{ViolationLimit, pooled_fit, violation_of};
+use super::options::{JoinLevel, MappingOptions};
+use super::refine::{dense, pose_graph};
+use super::surfaces::judge;
+use crate::control::{Cancelled, Control};
+use crate::geometry::Pose;
+use crate::graph::ScanGraph;
+
+/// A join of two components that are each a little bent, so that no rigid motion fits all that they share: they are joined on
+/// trial, adjusted together, and judged as they then stand. `None` when that does not help, or when another pose is nearly as well supported.
+pub fn bent_join(
+    graph: &ScanGraph,
+    (a, b): (&Component, &Component),
+    candidate: &Candidate,
+    level: &JoinLevel,
+    voxel: f64,
+    options: &MappingOptions,
+    control: Control<'_>,
+) -> Result<Option<Component>, Cancelled> {
+    if candidate.margin(options) < level.support {
+        return Ok(None);
+    }
+    let mut joined = a.clone();
+    joined.absorb(b.clone(), &pooled_fit(graph, a, b, candidate, voxel), graph, options);
+    let before = joined.clone();
+    pose_graph(graph, &mut joined, voxel, options, control)?;
+    dense(graph, &mut joined, None, voxel, control)?;
+    if !thrown(graph, &before, &joined, options).is_empty() {
+        return Ok(None);
+    }
+    let part = |of: &Component| {
+        let mut part = of.clone();
+        part.poses.retain(|key, pose| joined.poses.get(key).map(|moved| *pose = *moved).is_some());
+        part
+    };
+    let (x, y) = (part(a), part(b));
+    let found = violation_of(&judge(graph, &x, &y, &Pose::identity()));
+    let limit = ViolationLimit::new(graph, (a, b), candidate.support, level, options);
+    let banned = options.decisions.forbids(graph, &x, &y, &Pose::identity(), options);
+    let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
+    Ok((!banned && limit.admits(found) && kept >= level.support).then_some(joined))
+}
