@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::config::Config;
 use crate::http::{Api, openapi_yaml, router};
-use crate::jobs::{Compute, Exports, Intake, Workers};
+use crate::jobs::{Compute, Exports, Intake, Resumable, Workers};
 use crate::storage::{StorageError, Store};
 
 /// Why the service does not start.
@@ -78,9 +78,11 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         TcpListener::bind(config.listen).await.map_err(|error| StartError::Listen(config.listen, error))?;
     let addr = listener.local_addr().map_err(|error| StartError::Listen(config.listen, error))?;
     let stop = CancellationToken::new();
+    let intake = Intake::new(store.clone(), config.max_upload_bytes, config.upload_idle);
     let api = Api {
         store: store.clone(),
-        intake: Intake::new(store.clone(), config.max_upload_bytes, config.upload_idle),
+        resumable: Resumable::new(store.clone(), intake.clone(), config.upload_expiry, stop.clone()),
+        intake,
         exports: Exports::new(store.clone(), compute.clone(), config.workers.max_points),
         stop: stop.clone(),
         openapi: Arc::from(openapi_yaml().map_err(|problem| StartError::Description(problem.detail))?),

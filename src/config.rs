@@ -40,6 +40,9 @@ pub struct Settings {
     /// Seconds after which an upload that sends nothing is given up [default: 60]
     #[arg(long, env = "CAIRN_UPLOAD_IDLE_SECONDS", value_name = "SECONDS")]
     pub upload_idle_seconds: Option<u64>,
+    /// Hours after which a resumable upload that is not continued is forgotten [default: 168, which is a week]
+    #[arg(long, env = "CAIRN_UPLOAD_EXPIRY_HOURS", value_name = "HOURS")]
+    pub upload_expiry_hours: Option<u64>,
     /// Scans that one mapping job takes at once, at most [default: 32]
     #[arg(long, env = "CAIRN_BATCH", value_name = "N")]
     pub batch: Option<u32>,
@@ -61,6 +64,8 @@ pub struct Config {
     pub max_upload_bytes: u64,
     /// How long an upload may send nothing.
     pub upload_idle: Duration,
+    /// How long an upload in several requests is kept without being continued.
+    pub upload_expiry: Duration,
     /// The worker pool.
     pub workers: WorkerOptions,
     /// Whether logs are JSON.
@@ -121,6 +126,7 @@ impl Settings {
             lease_seconds: self.lease_seconds.or(other.lease_seconds),
             poll_seconds: self.poll_seconds.or(other.poll_seconds),
             upload_idle_seconds: self.upload_idle_seconds.or(other.upload_idle_seconds),
+            upload_expiry_hours: self.upload_expiry_hours.or(other.upload_expiry_hours),
             batch: self.batch.or(other.batch),
             log_json: self.log_json.or(other.log_json),
         }
@@ -144,6 +150,12 @@ impl Settings {
                 i64::MAX as u64,
             )?,
             upload_idle: seconds("upload-idle-seconds", self.upload_idle_seconds, 60)?,
+            upload_expiry: Duration::from_hours(within(
+                "upload-expiry-hours",
+                self.upload_expiry_hours.unwrap_or(168),
+                1,
+                87_600,
+            )?),
             workers: WorkerOptions {
                 workers: within("workers", workers, 1, 256)? as usize,
                 lease: seconds("lease-seconds", self.lease_seconds, 60)?,

@@ -4,6 +4,7 @@
 //! answer; every error is problem+json ([`Problem`]).
 
 mod cloud;
+mod content_digest;
 mod decision;
 mod download;
 mod events;
@@ -22,7 +23,10 @@ mod project;
 mod query;
 mod router;
 mod scan;
+mod tus;
 mod upload;
 
+pub use content_digest::parse_content_digest;
 pub use problem::Problem;
 pub use router::{Api, openapi_yaml, router};
+pub use tus::{Metadata, parse_checksum, parse_metadata};

@@ -106,6 +106,7 @@ impl From<StorageError> for Problem {
             | StorageError::NoScan(_)
             | StorageError::NoJob(_)
             | StorageError::NoDecision(_)
+            | StorageError::NoUpload(_)
             | StorageError::NoVersion(..) => Self::not_found(error.to_string()),
             StorageError::JobEnded(_) => Self::new(
                 StatusCode::CONFLICT,
@@ -120,6 +121,9 @@ impl From<StorageError> for Problem {
                 limit: Some(limit.into()),
                 ..Self::new(StatusCode::CONFLICT, "too-many-decisions", error.to_string())
             },
+            StorageError::DamagedUpload { .. } => {
+                Self::new(StatusCode::GONE, "upload-lost", format!("{error}; begin it anew"))
+            }
             other => Self::internal(other),
         }
     }
@@ -139,6 +143,10 @@ impl From<IntakeError> for Problem {
             IntakeError::WrongExtension { .. } => Self {
                 field: Some("name".to_owned()),
                 ..Self::new(StatusCode::UNPROCESSABLE_ENTITY, "wrong-extension", detail)
+            },
+            IntakeError::Digest(_) => Self {
+                field: Some("content-digest".to_owned()),
+                ..Self::new(StatusCode::BAD_REQUEST, "digest-mismatch", detail)
             },
             IntakeError::Interrupted { .. } => {
                 Self::new(StatusCode::BAD_REQUEST, "upload-interrupted", detail)

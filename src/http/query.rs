@@ -29,6 +29,12 @@ impl<S: Sync> FromRequestParts<S> for Params {
     }
 }
 
+impl From<BTreeMap<String, String>> for Params {
+    fn from(params: BTreeMap<String, String>) -> Self {
+        Self(params)
+    }
+}
+
 impl Params {
     fn parse(query: &str) -> Result<Self, Problem> {
         let mut params = BTreeMap::new();

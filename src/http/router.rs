@@ -19,9 +19,10 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::{
-    Problem, cloud, decision, events, graph, health, job, model, page, pose, preview, project, scan, upload,
+    Problem, cloud, decision, events, graph, health, job, model, page, pose, preview, project, scan, tus,
+    upload,
 };
-use crate::jobs::{Exports, Intake};
+use crate::jobs::{Exports, Intake, Resumable};
 use crate::storage::Store;
 
 /// What handlers work with. Clones share everything.
@@ -31,6 +32,8 @@ pub struct Api {
     pub store: Store,
     /// Takes uploads in.
     pub intake: Intake,
+    /// Takes uploads in that come in several requests.
+    pub resumable: Resumable,
     /// Makes files for download.
     pub exports: Exports,
     /// Cancelled when the service begins to stop: long answers end then.
@@ -50,6 +53,7 @@ pub struct Api {
     tags(
         (name = "projects", description = "Sets of scans of one place"),
         (name = "scans", description = "Uploads"),
+        (name = "uploads", description = "Uploads that survive broken connections: tus 1.0 (https://tus.io)"),
         (name = "jobs", description = "Work in progress, in the words of OGC API Processes"),
         (name = "decisions", description = "What clients decide where the data alone cannot tell: identical rooms, symmetric halls"),
         (name = "model", description = "Versions of a project's model, and what can be downloaded of them"),
@@ -65,6 +69,7 @@ fn routes() -> OpenApiRouter<Api> {
         .routes(routes!(upload::upload_scan, scan::list_scans))
         .routes(routes!(scan::get_scan, scan::delete_scan))
         .routes(routes!(scan::get_original))
+        .merge(tus::routes())
         .routes(routes!(job::create_job, job::list_jobs))
         .routes(routes!(job::get_job, job::dismiss_job))
         .routes(routes!(events::follow_job))

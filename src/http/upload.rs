@@ -8,6 +8,7 @@ use axum::response::IntoResponse;
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::content_digest::content_digest;
 use super::download::Bytes;
 use super::extract::Ids;
 use super::job::JobBody;
@@ -36,7 +37,8 @@ pub(super) struct UploadBody {
     ("project" = String, Path, description = "Id of the project"),
     ("name" = String, Query, description = "What to call the scan, such as its file name", min_length = 1, max_length = 200),
     ("units" = Option<String>, Query, description = "Unit of its coordinates: mm, cm, m, km, in, ft, us-ft, or metres in one unit; m if absent", min_length = 1),
-    ("sensor_position" = Option<String>, Query, description = "Where the sensor stood, in the scan's own frame, metres: x,y,z")),
+    ("sensor_position" = Option<String>, Query, description = "Where the sensor stood, in the scan's own frame, metres: x,y,z"),
+    ("content-digest" = Option<String>, Header, description = "RFC 9530: sha-256 or sha-512 of the body; a body that differs is refused")),
     request_body(content = Bytes, content_type = "application/octet-stream", description = "The file: PLY, PCD, XYZ or PTS"),
     responses(
     (status = 200, description = "The project has this content already", body = UploadBody),
@@ -56,9 +58,10 @@ pub(super) async fn upload_scan(
 ) -> Result<impl IntoResponse, Problem> {
     let request = UploadRequest {
         project,
-        name: name(&mut query)?,
+        name: name(&mut query, None)?,
         interpretation: interpretation(&mut query)?,
         declared_bytes: declared(&headers),
+        digests: content_digest(&headers)?,
     };
     query.finish()?;
     let admission = api.intake.receive(request, body.into_data_stream()).await?;
@@ -73,12 +76,15 @@ fn declared(headers: &HeaderMap) -> Option<u64> {
     headers.get(header::CONTENT_LENGTH)?.to_str().ok()?.parse().ok()
 }
 
-fn name(query: &mut Params) -> Result<Name, Problem> {
-    let text = query.text("name").ok_or_else(|| Problem::invalid("name", "`name` is missing"))?;
+/// The scan's name, or `otherwise` if it is not given.
+pub(super) fn name(params: &mut Params, otherwise: Option<String>) -> Result<Name, Problem> {
+    let text = params.text("name").or(otherwise);
+    let text = text.ok_or_else(|| Problem::invalid("name", "`name` is missing"))?;
     Name::parse(&text).map_err(|e| Problem::invalid("name", e.to_string()))
 }
 
-fn interpretation(query: &mut Params) -> Result<Interpretation, Problem> {
+/// `units` and `sensor_position`.
+pub(super) fn interpretation(query: &mut Params) -> Result<Interpretation, Problem> {
     let units =
         query.with("units", "mm, cm, m, km, in, ft, us-ft, or metres in one unit", metres_per_unit)?;
     let sensor_position = query.with("sensor_position", "three numbers in metres: x,y,z", |text| {

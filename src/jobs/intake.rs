@@ -8,8 +8,9 @@ use futures_util::{Stream, StreamExt};
 
 use crate::cloud::{Format, ScanKey, sniff};
 use crate::project::{Interpretation, Name, ProjectId};
-use crate::storage::{Admission, NewScan, StorageError, Store};
+use crate::storage::{Admission, NewScan, StorageError, Store, StoredBlob};
 
+use super::digest::{DigestCheck, DigestMismatch, ExpectedDigest};
 use super::parameters::content_key;
 
 /// What a client says about the bytes that it sends.
@@ -23,6 +24,8 @@ pub struct UploadRequest {
     pub interpretation: Interpretation,
     /// How many bytes there will be, if the client said so.
     pub declared_bytes: Option<u64>,
+    /// What they will hash to, if the client said so.
+    pub digests: Vec<ExpectedDigest>,
 }
 
 /// Why an upload is not taken in. Nothing of it is kept.
@@ -50,6 +53,9 @@ pub enum IntakeError {
         /// What the content is.
         found: String,
     },
+    /// The bytes that came are not those that were sent.
+    #[error(transparent)]
+    Digest(#[from] DigestMismatch),
     /// The connection broke.
     #[error("the upload broke off after {received} bytes: {reason}")]
     Interrupted {
@@ -80,7 +86,7 @@ pub struct Intake {
 }
 
 /// As much of an upload as is looked at to recognise its format.
-const HEAD_BYTES: usize = 16 * 1024;
+pub(super) const HEAD_BYTES: usize = 16 * 1024;
 
 impl Intake {
     /// Takes uploads of at most `max_bytes` in; gives one up when nothing comes for `idle`.
@@ -103,6 +109,7 @@ impl Intake {
         let mut writer = self.store.blobs.writer().await?;
         let mut head = Vec::new();
         let mut format = None;
+        let mut check = DigestCheck::new(request.digests);
         let mut body = std::pin::pin!(body);
         loop {
             let received = writer.bytes();
@@ -114,6 +121,7 @@ impl Intake {
             if received + piece.len() as u64 > limit {
                 return Err(IntakeError::TooLarge { limit });
             }
+            check.update(&piece);
             writer.write(&piece).await?;
             if format.is_none() {
                 head.extend(piece.iter().take(HEAD_BYTES - head.len()));
@@ -126,25 +134,39 @@ impl Intake {
         if writer.bytes() == 0 {
             return Err(IntakeError::Empty);
         }
+        check.finish()?;
         let format = format.map_or_else(|| recognise(&head, &request.name), Ok)?;
         // Pinned until the end of this function: the row comes last.
         let stored = writer.finish().await?;
-        let key = content_key(ScanKey::of_hash(&stored.id.0, &request.interpretation.to_bytes()));
-        let new = NewScan {
-            project: request.project,
-            key,
-            name: request.name,
-            format: word(format),
-            blob: stored.id,
-            bytes: stored.bytes,
-            interpretation: request.interpretation,
-        };
+        let new = scan_of(request.project, request.name, request.interpretation, format, *stored);
         Ok(self.store.admit_scan(&new).await?)
+    }
+
+    /// The largest upload, bytes.
+    pub(super) fn max_bytes(&self) -> u64 {
+        self.max_bytes
+    }
+
+    /// How long nothing may come.
+    pub(super) fn idle(&self) -> Duration {
+        self.idle
     }
 }
 
+/// The scan that a stored upload is to become.
+pub(super) fn scan_of(
+    project: ProjectId,
+    name: Name,
+    interpretation: Interpretation,
+    format: Format,
+    stored: StoredBlob,
+) -> NewScan {
+    let key = content_key(ScanKey::of_hash(&stored.id.0, &interpretation.to_bytes()));
+    NewScan { project, key, name, format: word(format), blob: stored.id, bytes: stored.bytes, interpretation }
+}
+
 /// The format of a content, unless the name claims another one.
-fn recognise(head: &[u8], name: &Name) -> Result<Format, IntakeError> {
+pub(super) fn recognise(head: &[u8], name: &Name) -> Result<Format, IntakeError> {
     let found = sniff(head).ok_or(IntakeError::UnknownFormat)?;
     let Some((_, extension)) = name.as_str().rsplit_once('.') else { return Ok(found) };
     let claimed = Format::from_extension(&extension.to_ascii_lowercase());

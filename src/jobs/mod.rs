@@ -7,6 +7,7 @@
 mod compute;
 mod content;
 mod decide;
+mod digest;
 mod error;
 mod exports;
 mod ingest;
@@ -22,14 +23,20 @@ mod reason;
 mod refine;
 mod register;
 mod remove;
+mod resumable;
+#[cfg(test)]
+mod resumable_tests;
 mod session;
+mod turnstile;
 mod workers;
 
 pub use crate::cloud::metres_per_unit;
 pub use compute::{Compute, Panicked};
+pub use digest::{DigestAlgorithm, DigestMismatch, ExpectedDigest};
 pub use error::JobError;
 pub use exports::{CloudRequest, ComponentChoice, ExportError, Exports};
 pub use intake::{Intake, IntakeError, UploadRequest};
 pub use parameters::DECIDING_SCANS;
 pub use reason::{reason_of, reason_of_refusal};
+pub use resumable::{Continuation, Resumable, ResumableError};
 pub use workers::{WorkerOptions, Workers};

@@ -64,6 +64,10 @@ id! {
     /// Names a decision about two scans.
     DecisionId
 }
+id! {
+    /// Names an upload that arrives in several requests.
+    UploadId
+}
 
 /// Counts the versions of a project's model: 1 is the first, and 0 the empty model before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default, Serialize, Deserialize)]

@@ -11,9 +11,10 @@ mod open_join;
 mod scan;
 mod settings;
 mod time;
+mod upload;
 
 pub use decision::{BadMotion, Decision, KeptDecision, Verdict, motion};
-pub use id::{BadId, DecisionId, JobId, ProjectId, ScanId, VersionNumber};
+pub use id::{BadId, DecisionId, JobId, ProjectId, ScanId, UploadId, VersionNumber};
 pub use job::{BadJobKind, Fault, Job, JobKind, JobState, Lane};
 pub use model::{Component, Edge, ModelContent, Placement, Reason, Standing, Version};
 pub use name::{BadName, Name};
@@ -21,3 +22,4 @@ pub use open_join::{OpenJoin, RivalPose, Undone};
 pub use scan::{BadInterpretation, ContentKey, Interpretation, Scan, ScanState};
 pub use settings::{BadSettings, Project, ProjectSettings};
 pub use time::Timestamp;
+pub use upload::{NewUpload, Upload, UploadEnd};

@@ -10,7 +10,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use tokio::io::AsyncWriteExt;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use ulid::Ulid;
 
 use super::StorageError;
@@ -113,6 +113,16 @@ impl BlobStore {
         Ok(FreshBlob::new(StoredBlob { id, bytes }, pin))
     }
 
+    /// Makes a synced file of this file system a blob; the file moves. `stored` is what it holds. Blocks.
+    pub(super) fn adopt(&self, file: &Path, stored: StoredBlob) -> Result<FreshBlob, StorageError> {
+        Ok(FreshBlob::new(stored, self.place(file, stored.id)?))
+    }
+
+    /// Keeps a blob that is there from being collected.
+    pub(super) fn hold(&self, stored: StoredBlob) -> FreshBlob {
+        FreshBlob::new(stored, Pin::new(&self.pins, stored.id))
+    }
+
     /// Reads a whole blob into memory and checks it. Blocks.
     pub fn get(&self, id: BlobId) -> Result<Vec<u8>, StorageError> {
         let mut bytes = Vec::new();
@@ -129,6 +139,14 @@ impl BlobStore {
             Err(e) if e.kind() == io::ErrorKind::NotFound => Err(StorageError::MissingBlob(id.to_string())),
             Err(e) => Err(StorageError::io("opening a blob")(e)),
         }
+    }
+
+    /// The first bytes of a blob, at most `limit`. They are not checked.
+    pub async fn head(&self, id: BlobId, limit: usize) -> Result<Vec<u8>, StorageError> {
+        let mut head = Vec::new();
+        let file = tokio::fs::File::open(self.path(id)).await.map_err(StorageError::io("opening a blob"))?;
+        file.take(limit as u64).read_to_end(&mut head).await.map_err(StorageError::io("reading a blob"))?;
+        Ok(head)
     }
 
     fn temporary(&self) -> PathBuf {
@@ -158,17 +176,22 @@ impl BlobStore {
         self.pins.take_released()
     }
 
-    /// Pins the blob, moves a synced temporary file to its place and syncs the folders on the way. An equal blob that
-    /// is there already is replaced, which repairs it if it was damaged.
     fn settle(&self, mut partial: Partial, id: BlobId) -> Result<Pin, StorageError> {
+        let pin = self.place(&partial.path, id)?;
+        partial.kept = true;
+        Ok(pin)
+    }
+
+    /// Pins the blob, moves a synced file to its place and syncs the folders on the way. An equal blob that is there
+    /// already is replaced, which repairs it if it was damaged.
+    fn place(&self, from: &Path, id: BlobId) -> Result<Pin, StorageError> {
         let pin = Pin::new(&self.pins, id);
         let place = self.path(id);
         let folders: Vec<&Path> = place.ancestors().skip(1).take(3).collect();
         if let Some(inner) = folders.first() {
             fs::create_dir_all(inner).map_err(StorageError::io("making a folder of blobs"))?;
         }
-        fs::rename(&partial.path, &place).map_err(StorageError::io("naming a blob"))?;
-        partial.kept = true;
+        fs::rename(from, &place).map_err(StorageError::io("naming a blob"))?;
         for folder in folders {
             File::open(folder)
                 .and_then(|folder| folder.sync_all())

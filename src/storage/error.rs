@@ -1,6 +1,6 @@
 //! What can go wrong below the service.
 
-use crate::project::{DecisionId, JobId, ProjectId, ScanId, VersionNumber};
+use crate::project::{DecisionId, JobId, ProjectId, ScanId, UploadId, VersionNumber};
 
 /// A failure of the database or of the blob files.
 #[derive(Debug, thiserror::Error)]
@@ -17,6 +17,19 @@ pub enum StorageError {
     /// No such decision in the project, or it was taken back, or went with a scan.
     #[error("there is no decision {0}")]
     NoDecision(DecisionId),
+    /// No such upload, or it was taken back, or it expired long ago.
+    #[error("there is no upload {0}")]
+    NoUpload(UploadId),
+    /// Bytes of an upload that were safe on disk are there no more, such as after a restored backup.
+    #[error("upload {upload} has lost its bytes: {kept} were kept, {found} are there")]
+    DamagedUpload {
+        /// The upload.
+        upload: UploadId,
+        /// Bytes that its row knows.
+        kept: u64,
+        /// Bytes in its file.
+        found: u64,
+    },
     /// The project holds as many decisions as it may.
     #[error(
         "project {project} holds {limit} decisions, which is the limit; take back what no longer matters"

@@ -7,6 +7,7 @@
 use sqlx::Row;
 
 use super::{BlobId, StorageError, Store};
+use crate::project::Timestamp;
 
 /// Blobs looked at in one transaction.
 const AT_ONCE: i64 = 64;
@@ -19,12 +20,14 @@ const NOTED: &str = "
            OR EXISTS (SELECT 1 FROM versions v JOIN projects p ON p.id = v.project_id
                       WHERE v.snapshot = g.blob AND v.number = p.head)
            OR EXISTS (SELECT 1 FROM versions v WHERE v.content = g.blob)
+           OR EXISTS (SELECT 1 FROM uploads u WHERE u.blob = g.blob AND u.scan_id IS NULL)
            OR EXISTS (SELECT 1 FROM derived d WHERE d.blob = g.blob) AS needed
     FROM garbage g WHERE g.rowid > ? ORDER BY g.rowid LIMIT ?";
 
 impl Store {
     /// Deletes the files of blobs that no row needs any more. Returns how many.
     pub async fn collect_garbage(&self) -> Result<usize, StorageError> {
+        self.forget_uploads(Timestamp::now()).await?;
         self.note_released().await?;
         let (mut collected, mut after) = (0, 0);
         loop {

@@ -19,6 +19,8 @@ mod publication;
 mod rows;
 mod scans;
 mod store;
+mod upload_files;
+mod uploads;
 mod versions;
 
 pub use blobs::{BlobId, BlobReader, BlobStore, BlobWriter, StoredBlob};
@@ -30,3 +32,4 @@ pub use pins::FreshBlob;
 pub use publication::{NewVersion, Publication, ScanChange};
 pub use scans::{Admission, NewScan};
 pub use store::{Page, Store};
+pub use upload_files::{UploadFile, UploadFiles};

@@ -8,7 +8,7 @@ use super::rows::{count, json, parsed, to_json, word};
 use super::{BlobId, Page, StorageError, Store};
 use crate::project::{
     ContentKey, Interpretation, Job, JobId, JobKind, Lane, Name, ProjectId, Scan, ScanId, ScanState,
-    Timestamp,
+    Timestamp, UploadEnd,
 };
 
 /// An upload that is safe on disk and waits to be acknowledged.
@@ -45,34 +45,23 @@ impl Store {
     /// Acknowledges an upload: the scan and its job, in one transaction. Content that the project has already is
     /// answered with the scan that it is; if that has failed or was dismissed, a new job tries again.
     pub async fn admit_scan(&self, new: &NewScan) -> Result<Admission, StorageError> {
-        let now = Timestamp::now();
         let mut tx = self.begin().await?;
-        let project = new.project.to_string();
-        let known = sqlx::query(
-            "SELECT id, job_id, state FROM scans WHERE project_id = ? AND content_key = ? AND deleted_ms IS NULL",
-        )
-        .bind(&project)
-        .bind(new.key.0.to_be_bytes().as_slice())
-        .fetch_optional(&mut *tx)
-        .await?;
-        let (scan, job, duplicate) = if let Some(row) = known {
-            let scan = parsed(&row, "id")?;
-            match word(&row, "state", ScanState::from_word)? {
-                ScanState::Failed | ScanState::Dismissed => {
-                    (scan, try_again(&mut tx, new, scan, now).await?, false)
-                }
-                _ => (scan, parsed(&row, "job_id")?, true),
-            }
-        } else {
-            let (scan, job) = insert_scan(&mut tx, new, now).await?;
-            (scan, job, false)
-        };
+        let admitted = admit(&mut tx, new, Timestamp::now()).await?;
         tx.commit().await?;
+        self.admitted(new.project, admitted).await
+    }
+
+    /// Tells whom it concerns of a scan whose admission is committed.
+    pub(super) async fn admitted(
+        &self,
+        project: ProjectId,
+        UploadEnd { scan, job, duplicate }: UploadEnd,
+    ) -> Result<Admission, StorageError> {
         if !duplicate {
             self.announce([job]);
             self.ring();
         }
-        let (scan, job) = (self.scan(new.project, scan).await?, self.job(job).await?);
+        let (scan, job) = (self.scan(project, scan).await?, self.job(job).await?);
         Ok(Admission { scan, job, duplicate })
     }
 
@@ -157,6 +146,32 @@ impl Store {
         self.announce([registration, job]);
         self.ring();
         self.job(job).await
+    }
+}
+
+/// Admits a scan within a transaction.
+pub(super) async fn admit(
+    tx: &mut Transaction<'static, Sqlite>,
+    new: &NewScan,
+    now: Timestamp,
+) -> Result<UploadEnd, StorageError> {
+    let known = sqlx::query(
+        "SELECT id, job_id, state FROM scans WHERE project_id = ? AND content_key = ? AND deleted_ms IS NULL",
+    )
+    .bind(new.project.to_string())
+    .bind(new.key.0.to_be_bytes().as_slice())
+    .fetch_optional(&mut **tx)
+    .await?;
+    let Some(row) = known else {
+        let (scan, job) = insert_scan(tx, new, now).await?;
+        return Ok(UploadEnd { scan, job, duplicate: false });
+    };
+    let scan = parsed(&row, "id")?;
+    match word(&row, "state", ScanState::from_word)? {
+        ScanState::Failed | ScanState::Dismissed => {
+            Ok(UploadEnd { scan, job: try_again(tx, new, scan, now).await?, duplicate: false })
+        }
+        _ => Ok(UploadEnd { scan, job: parsed(&row, "job_id")?, duplicate: true }),
     }
 }
 

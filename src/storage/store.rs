@@ -11,7 +11,7 @@ use sqlx::sqlite::{
 use sqlx::{Sqlite, Transaction};
 use tokio::sync::{Notify, broadcast};
 
-use super::{BlobStore, StorageError};
+use super::{BlobStore, StorageError, UploadFiles};
 use crate::project::JobId;
 
 /// How long a statement waits for a lock that another process holds, such as a backup.
@@ -37,6 +37,8 @@ pub struct Store {
     write: SqlitePool,
     /// Content-addressed files.
     pub blobs: BlobStore,
+    /// Uploads that are not complete.
+    pub uploads: UploadFiles,
     bells: Arc<Bells>,
 }
 
@@ -54,6 +56,7 @@ impl Store {
         std::fs::create_dir_all(data).map_err(StorageError::io("making the data directory"))?;
         let lock = lock(data)?;
         let blobs = BlobStore::open(&data.join("blobs"))?;
+        let uploads = UploadFiles::open(&data.join("uploads"))?;
         let options = SqliteConnectOptions::new()
             .filename(data.join("cairn.sqlite"))
             .create_if_missing(true)
@@ -71,7 +74,7 @@ impl Store {
             .and_then(|folder| folder.sync_all())
             .map_err(StorageError::io("syncing the data directory"))?;
         let bells = Bells { changed: broadcast::Sender::new(CHANGES), work: Notify::new(), _lock: lock };
-        Ok(Self { read, write, blobs, bells: Arc::new(bells) })
+        Ok(Self { read, write, blobs, uploads, bells: Arc::new(bells) })
     }
 
     /// Opens a write transaction. It takes the write lock at once, so that it cannot fail half-way on a lock.

@@ -8,4 +8,6 @@ mod jobs;
 mod lifecycle;
 mod restore;
 mod server;
+mod tus;
+mod tus_clients;
 mod uploads;

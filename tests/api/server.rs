@@ -56,6 +56,19 @@ impl Server {
         Self::on(self.data, Settings::default()).await
     }
 
+    /// Changes the database behind the service's back.
+    pub async fn sql(&self, statement: &'static str) {
+        let options = SqliteConnectOptions::new().filename(self.data.path().join("cairn.sqlite"));
+        let mut database = SqliteConnection::connect_with(&options).await.unwrap();
+        sqlx::query(statement).execute(&mut database).await.unwrap();
+        database.close().await.unwrap();
+    }
+
+    /// Files in a folder of the data directory.
+    pub fn files(&self, folder: &str) -> usize {
+        std::fs::read_dir(self.data.path().join(folder)).unwrap().count()
+    }
+
     pub async fn stop(self) {
         self.running.stop().await;
     }
