@@ -11,6 +11,7 @@ mod events;
 mod extract;
 mod graph;
 mod health;
+mod idempotency;
 mod job;
 mod link;
 mod model;

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use axum::Router;
 use axum::extract::Request;
 use axum::http::{HeaderName, HeaderValue, StatusCode};
+use axum::middleware::from_fn_with_state;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use tokio_util::sync::CancellationToken;
@@ -18,6 +19,7 @@ use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::idempotency::{self, Running, idempotent};
 use super::{
     Problem, cloud, decision, events, graph, health, job, model, page, pose, preview, project, scan, tus,
     upload,
@@ -89,7 +91,7 @@ fn routes() -> OpenApiRouter<Api> {
 
 /// The description of the interface as YAML: what `/openapi.yaml` answers and the repository keeps.
 pub fn openapi_yaml() -> Result<String, Problem> {
-    routes().into_openapi().to_yaml().map_err(Problem::internal)
+    idempotency::describe(routes().into_openapi()).to_yaml().map_err(Problem::internal)
 }
 
 /// The whole service as a router.
@@ -112,6 +114,7 @@ pub fn router(api: Api) -> Router {
                 "this address does not answer this method",
             )
         })
+        .layer(from_fn_with_state((api.clone(), Running::default()), idempotent))
         .with_state(api)
         .layer(layers)
 }

@@ -101,6 +101,12 @@ impl Resumable {
         self.intake.max_bytes()
     }
 
+    /// How long a request may bring nothing.
+    #[must_use]
+    pub fn idle(&self) -> Duration {
+        self.intake.idle()
+    }
+
     /// Notes an upload that will come.
     pub async fn create(&self, new: NewUpload) -> Result<Upload, ResumableError> {
         let limit = self.max_bytes();

@@ -27,7 +27,9 @@ const NOTED: &str = "
 impl Store {
     /// Deletes the files of blobs that no row needs any more. Returns how many.
     pub async fn collect_garbage(&self) -> Result<usize, StorageError> {
-        self.forget_uploads(Timestamp::now()).await?;
+        let now = Timestamp::now();
+        self.forget_uploads(now).await?;
+        self.forget_answers(now).await?;
         self.note_released().await?;
         let (mut collected, mut after) = (0, 0);
         loop {

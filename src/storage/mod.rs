@@ -10,6 +10,7 @@ mod decisions;
 mod derived;
 mod error;
 mod garbage;
+mod idempotency;
 mod job_rows;
 #[cfg(test)]
 mod lease_tests;
@@ -27,6 +28,7 @@ pub use blobs::{BlobId, BlobReader, BlobStore, BlobWriter, StoredBlob};
 pub use claims::{Claim, Lease, Measures};
 pub use derived::Owner;
 pub use error::StorageError;
+pub use idempotency::KeptAnswer;
 pub use job_rows::JobFilter;
 pub use pins::FreshBlob;
 pub use publication::{NewVersion, Publication, ScanChange};

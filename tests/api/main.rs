@@ -4,6 +4,7 @@ mod bad_files;
 mod decisions;
 mod description;
 mod downloads;
+mod idempotency;
 mod jobs;
 mod lifecycle;
 mod restore;
