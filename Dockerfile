@@ -1,5 +1,6 @@
 # The service in a container:
 #   docker build -t cairn .
+#   docker run --rm -v cairn-data:/data cairn key create me --scope manage --all-projects
 #   docker run -p 8080:8080 -v cairn-data:/data cairn
 # Settings are environment variables (README, "Settings"). All state is in the volume /data.
 

@@ -9,7 +9,7 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::Config;
-use crate::http::{Api, openapi_yaml, router};
+use crate::http::{Api, Openness, openapi_yaml, router};
 use crate::jobs::{Compute, Exports, Intake, Resumable, Workers};
 use crate::storage::{StorageError, Store};
 
@@ -25,6 +25,12 @@ pub enum StartError {
     /// The address cannot be listened on.
     #[error("cannot listen on {0}: {1}")]
     Listen(SocketAddr, std::io::Error),
+    /// Strangers could reach it, and there is no key.
+    #[error(
+        "{0} can be reached from other machines, and no key is valid: make one with `cairn key create`, or say \
+         `--allow-anonymous` if whoever reaches the address may do everything"
+    )]
+    Unguarded(SocketAddr),
     /// The interface's description cannot be written.
     #[error("the description of the interface: {0}")]
     Description(String),
@@ -73,6 +79,13 @@ const DRAIN: std::time::Duration = std::time::Duration::from_secs(10);
 pub async fn start(config: Config) -> Result<Running, StartError> {
     let store =
         Store::open(&config.data).await.map_err(|error| StartError::Data(config.data.clone(), error))?;
+    let openness = Openness::of(config.allow_anonymous, config.listen);
+    if openness == Openness::Closed
+        && !store.keys().any_valid().await.map_err(|error| StartError::Data(config.data.clone(), error))?
+    {
+        store.close().await;
+        return Err(StartError::Unguarded(config.listen));
+    }
     let compute = Compute::new(config.threads)?;
     let listener =
         TcpListener::bind(config.listen).await.map_err(|error| StartError::Listen(config.listen, error))?;
@@ -84,6 +97,7 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         resumable: Resumable::new(store.clone(), intake.clone(), config.upload_expiry, stop.clone()),
         intake,
         exports: Exports::new(store.clone(), compute.clone(), config.workers.max_points),
+        openness,
         stop: stop.clone(),
         openapi: Arc::from(openapi_yaml().map_err(|problem| StartError::Description(problem.detail))?),
     };

@@ -46,6 +46,9 @@ pub struct Settings {
     /// Scans that one mapping job takes at once, at most [default: 32]
     #[arg(long, env = "CAIRN_BATCH", value_name = "N")]
     pub batch: Option<u32>,
+    /// Serve requests without a key, whoever sends them [default: false]
+    #[arg(long, env = "CAIRN_ALLOW_ANONYMOUS", value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
+    pub allow_anonymous: Option<bool>,
     /// Write logs as JSON [default: false]
     #[arg(long, env = "CAIRN_LOG_JSON", value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     pub log_json: Option<bool>,
@@ -68,9 +71,15 @@ pub struct Config {
     pub upload_expiry: Duration,
     /// The worker pool.
     pub workers: WorkerOptions,
+    /// Whether requests without a key are served whoever sends them. If not, then only those from this machine, and only
+    /// until the first key is made.
+    pub allow_anonymous: bool,
     /// Whether logs are JSON.
     pub log_json: bool,
 }
+
+/// The directory of all state, unless a setting says otherwise.
+pub const DEFAULT_DATA: &str = "cairn-data";
 
 /// Why settings are refused.
 #[derive(Debug, thiserror::Error)]
@@ -128,6 +137,7 @@ impl Settings {
             upload_idle_seconds: self.upload_idle_seconds.or(other.upload_idle_seconds),
             upload_expiry_hours: self.upload_expiry_hours.or(other.upload_expiry_hours),
             batch: self.batch.or(other.batch),
+            allow_anonymous: self.allow_anonymous.or(other.allow_anonymous),
             log_json: self.log_json.or(other.log_json),
         }
     }
@@ -141,7 +151,7 @@ impl Settings {
         };
         Ok(Config {
             listen: self.listen.unwrap_or_else(|| SocketAddr::from(([127, 0, 0, 1], 8080))),
-            data: self.data.unwrap_or_else(|| PathBuf::from("cairn-data")),
+            data: self.data.unwrap_or_else(|| PathBuf::from(DEFAULT_DATA)),
             threads: within("threads", threads, 0, 1024)? as usize,
             max_upload_bytes: within(
                 "max-upload-bytes",
@@ -166,6 +176,7 @@ impl Settings {
                 collect_every: Duration::from_secs(10),
                 grace: Duration::from_secs(20),
             },
+            allow_anonymous: self.allow_anonymous.unwrap_or(false),
             log_json: self.log_json.unwrap_or(false),
         })
     }

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use cairn::cli::{bench, calibrate, demo, evaluate, openapi, register, serve, simulate};
+use cairn::cli::{bench, calibrate, demo, evaluate, key, openapi, register, serve, simulate};
 
 /// Fits many 3-D scans of one place into one model
 #[derive(Debug, Parser)]
@@ -17,6 +17,7 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Serve(serve::ServeArgs),
+    Key(key::KeyArgs),
     Register(register::RegisterArgs),
     Demo(demo::DemoArgs),
     Evaluate(evaluate::EvaluateArgs),
@@ -36,6 +37,7 @@ fn main() -> ExitCode {
 fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Serve(args) => serve::run(args)?,
+        Command::Key(args) => key::run(args)?,
         Command::Register(args) => return register::run(&args),
         Command::Demo(args) => return demo::run(&args),
         Command::Evaluate(args) => evaluate::run(&args)?,

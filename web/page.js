@@ -4,11 +4,57 @@ const $ = (id) => document.getElementById(id);
 const sleep = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 let shownVersion = null;
 
+// The key stays in this tab, goes into a header, and never into an address: addresses are logged and shared.
+const key = () => sessionStorage.getItem("key");
+
+function showKeyForm(needed) {
+  $("key-form").hidden = !needed;
+  $("forget-key").hidden = needed || !key();
+  $("layout").hidden = needed;
+}
+
+/** An answer of the API, or an error that says what its problem says. */
+async function request(path, options) {
+  const headers = new Headers(options?.headers);
+  if (key()) headers.set("authorization", `Bearer ${key()}`);
+  const response = await fetch(path, { ...options, headers });
+  showKeyForm(response.status === 401);
+  if (response.ok) return response;
+  const problem = await response.json().catch(() => null);
+  throw new Error(problem?.detail ?? response.statusText);
+}
+
 async function api(path, options) {
-  const response = await fetch(path, options);
-  const body = response.status === 204 ? null : await response.json();
-  if (!response.ok) throw new Error(body?.detail ?? response.statusText);
-  return body;
+  const response = await request(path, options);
+  return response.status === 204 ? null : response.json();
+}
+
+/** A link to something to download. With a key, which a link cannot carry, it is fetched: to a file where the browser can. */
+function download(text, path, name) {
+  const link = element("a", { href: path }, text);
+  const fetched = async () => {
+    const file = await window.showSaveFilePicker?.({ suggestedName: name }).then((handle) => handle.createWritable());
+    const response = await request(path);
+    if (file) return response.body.pipeTo(file);
+    const address = URL.createObjectURL(await response.blob());
+    element("a", { href: address, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(address), 60_000);
+  };
+  link.addEventListener("click", (event) => {
+    if (!key()) return;
+    event.preventDefault();
+    fetched().catch((error) => { $("notice").textContent = error.name === "AbortError" ? "" : error.message; });
+  });
+  return link;
+}
+
+/** Shows a picture. */
+async function showPicture(path) {
+  const picture = $("preview");
+  const address = key() ? URL.createObjectURL(await (await request(path)).blob()) : path;
+  picture.onload = () => { picture.hidden = false; URL.revokeObjectURL(address); };
+  picture.onerror = () => { picture.hidden = true; URL.revokeObjectURL(address); };
+  picture.src = address;
 }
 
 /** All items of a list. */
@@ -43,7 +89,7 @@ function scanRow(scan) {
   if (out?.status === "failed") where = out.problem.detail;
   const path = `/v1/projects/${scan.project}/scans/${scan.id}`;
   return element("tr", {},
-    element("td", {}, element("a", { href: `${path}/original` }, scan.name)),
+    element("td", {}, download(scan.name, `${path}/original`, scan.name)),
     element("td", { class: "fix" }, state(scan.state)),
     element("td", { class: "soft" }, where),
     element("td", { class: "fix soft" }, scan.points ? `${scan.points.toLocaleString("en")} points` : bytes(scan.bytes)));
@@ -148,14 +194,12 @@ async function showVersion(project, own) {
   $("open").hidden = model.open_joins.length === 0;
   $("open-joins").replaceChildren(...model.open_joins.map((open) => openJoinRow(open, own, model.version)));
   const at = `version=${project.version}`;
-  const links = [["merged cloud", `cloud?${at}`], ["poses (json)", `poses?${at}`], ["poses (TUM)", `poses?format=tum&${at}`],
-    ["poses (3DMatch log)", `poses?format=3dmatch-log&${at}`], ["graph", `graph?${at}`], ["model", `versions/${project.version}`]];
-  $("downloads").replaceChildren(...(some ? links.map(([text, path]) => element("a", { href: `${own}/${path}` }, text)) : []));
-  const picture = $("preview");
-  picture.onload = () => { picture.hidden = false; };
-  picture.onerror = () => { picture.hidden = true; };
-  if (some) picture.src = `${own}/preview?${at}`;
-  else picture.hidden = true;
+  const links = [["merged cloud", `cloud?${at}`, "merged.ply"], ["poses (json)", `poses?${at}`, "poses.json"],
+    ["poses (TUM)", `poses?format=tum&${at}`, "poses.tum"], ["poses (3DMatch log)", `poses?format=3dmatch-log&${at}`, "poses.log"],
+    ["graph", `graph?${at}`, "graph.json"], ["model", `versions/${project.version}`, "model.json"]];
+  $("downloads").replaceChildren(...(some ? links.map(([text, path, name]) => download(text, `${own}/${path}`, name)) : []));
+  if (some) await showPicture(`${own}/preview?${at}`).catch(() => { $("preview").hidden = true; });
+  else $("preview").hidden = true;
 }
 
 async function refresh() {
@@ -188,6 +232,18 @@ $("new-project").addEventListener("submit", (event) => {
     location.hash = made.id;
   });
 });
+$("key-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  sessionStorage.setItem("key", $("key").value.trim());
+  $("key").value = "";
+  $("key-refused").hidden = true;
+  shownVersion = null;
+  refresh().catch(() => { $("key-refused").hidden = $("key-form").hidden; });
+});
+$("forget-key").addEventListener("click", () => {
+  sessionStorage.removeItem("key");
+  location.reload();
+});
 $("files").addEventListener("change", (event) => act(() => upload([...event.target.files])));
 for (const asked of document.querySelectorAll("[data-kind]")) {
   asked.addEventListener("click", () => act(() => post(`/v1/projects/${chosen()}/jobs`, { kind: asked.dataset.kind })));
@@ -196,6 +252,6 @@ addEventListener("hashchange", () => refresh().catch(() => {}));
 
 for (;;) {
   // The service may be restarting; the next look will tell.
-  await refresh().catch(() => {});
+  if ($("key-form").hidden) await refresh().catch(() => {});
   await sleep(document.hidden ? 10_000 : 1_500);
 }

@@ -4,6 +4,7 @@ pub mod bench;
 pub mod calibrate;
 pub mod demo;
 pub mod evaluate;
+pub mod key;
 pub mod openapi;
 mod progress;
 pub mod register;

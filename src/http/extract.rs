@@ -17,9 +17,14 @@ impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for Ids<T> 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
         match Path::<T>::from_request_parts(parts, state).await {
             Ok(Path(ids)) => Ok(Self(ids)),
-            Err(_) => Err(Problem::not_found("the path holds something that is no id")),
+            Err(_) => Err(no_id()),
         }
     }
+}
+
+/// Text of the path that is no id names nothing.
+pub(super) fn no_id() -> Problem {
+    Problem::not_found("the path holds something that is no id")
 }
 
 /// A JSON body.

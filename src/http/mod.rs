@@ -3,6 +3,7 @@
 //! Uses `project`, `storage` and the entrances of `jobs`; `app` serves the router. Handlers parse, make one call, and
 //! answer; every error is problem+json ([`Problem`]).
 
+mod access;
 mod cloud;
 mod content_digest;
 mod decision;
@@ -27,7 +28,8 @@ mod scan;
 mod tus;
 mod upload;
 
+pub use access::Openness;
 pub use content_digest::parse_content_digest;
 pub use problem::Problem;
-pub use router::{Api, openapi_yaml, router};
+pub use router::{Api, description, openapi_yaml, router};
 pub use tus::{Metadata, parse_checksum, parse_metadata};

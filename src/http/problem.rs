@@ -95,6 +95,11 @@ impl IntoResponse for Problem {
         let mut response = (status, axum::Json(&self)).into_response();
         let problem = HeaderValue::from_static("application/problem+json");
         response.headers_mut().insert(header::CONTENT_TYPE, problem);
+        if status == StatusCode::UNAUTHORIZED {
+            response
+                .headers_mut()
+                .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"cairn\""));
+        }
         response
     }
 }
@@ -107,6 +112,7 @@ impl From<StorageError> for Problem {
             | StorageError::NoJob(_)
             | StorageError::NoDecision(_)
             | StorageError::NoUpload(_)
+            | StorageError::NoKey(_)
             | StorageError::NoVersion(..) => Self::not_found(error.to_string()),
             StorageError::JobEnded(_) => Self::new(
                 StatusCode::CONFLICT,

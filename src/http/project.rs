@@ -7,6 +7,7 @@ use axum::response::IntoResponse;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::access::Caller;
 use super::extract::{Body, Ids};
 use super::link::Link;
 use super::problem::{Problem, Problems};
@@ -108,18 +109,19 @@ pub(super) async fn create_project(
     Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(ProjectBody::from(project))))
 }
 
-/// Lists projects.
+/// Lists projects: those that the key reaches.
 #[utoipa::path(get, path = "/v1/projects", tag = "projects", params(
     ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer", pattern = "^[0-9a-f]{1,15}$"),
     ("limit" = Option<u32>, Query, description = "At most so many items, 1 to 200; 50 if absent", minimum = 1, maximum = 200)),
     responses((status = 200, description = "A part of the list", body = ProjectList), Problems))]
 pub(super) async fn list_projects(
     State(api): State<Api>,
+    caller: Caller,
     mut query: Params,
 ) -> Result<Json<ProjectList>, Problem> {
     let page = query.page()?;
     query.finish()?;
-    let found = api.store.projects(page).await?;
+    let found = api.store.projects(page, caller.granted()).await?;
     let next = found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at));
     Ok(Json(ProjectList { items: found.into_iter().map(|(_, p)| p.into()).collect(), next }))
 }

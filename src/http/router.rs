@@ -21,8 +21,8 @@ use utoipa_axum::routes;
 
 use super::idempotency::{self, Running, idempotent};
 use super::{
-    Problem, cloud, decision, events, graph, health, job, model, page, pose, preview, project, scan, tus,
-    upload,
+    Openness, Problem, access, cloud, decision, events, graph, health, job, model, page, pose, preview,
+    project, scan, tus, upload,
 };
 use crate::jobs::{Exports, Intake, Resumable};
 use crate::storage::Store;
@@ -38,6 +38,8 @@ pub struct Api {
     pub resumable: Resumable,
     /// Makes files for download.
     pub exports: Exports,
+    /// Whether requests without a key are served.
+    pub openness: Openness,
     /// Cancelled when the service begins to stop: long answers end then.
     pub stop: CancellationToken,
     /// The description of the interface, YAML.
@@ -49,7 +51,9 @@ pub struct Api {
     info(
         title = "Cairn",
         description = "Multiview scan registration. Upload scans into a project; each is added to the project's model \
-            by a job; poll the job, then download poses and the merged cloud. Poses are `model_from_scan`: they map \
+            by a job; poll the job, then download poses and the merged cloud. A key is sent as a bearer token; \
+            each operation says in `x-cairn-scope` whether it needs one that may `read`, `upload` or `manage`, and what a key does \
+            not reach is answered as what does not exist. Poses are `model_from_scan`: they map \
             points of a scan into the frame of its component. Lengths are metres. Errors are RFC 9457 problem details."
     ),
     tags(
@@ -89,9 +93,15 @@ fn routes() -> OpenApiRouter<Api> {
         .routes(routes!(health::openapi))
 }
 
+/// The description of the interface.
+#[must_use]
+pub fn description() -> utoipa::openapi::OpenApi {
+    access::describe(idempotency::describe(routes().into_openapi()))
+}
+
 /// The description of the interface as YAML: what `/openapi.yaml` answers and the repository keeps.
 pub fn openapi_yaml() -> Result<String, Problem> {
-    idempotency::describe(routes().into_openapi()).to_yaml().map_err(Problem::internal)
+    description().to_yaml().map_err(Problem::internal)
 }
 
 /// The whole service as a router.
@@ -115,6 +125,7 @@ pub fn router(api: Api) -> Router {
             )
         })
         .layer(from_fn_with_state((api.clone(), Running::default()), idempotent))
+        .layer(from_fn_with_state(api.clone(), access::guard))
         .with_state(api)
         .layer(layers)
 }

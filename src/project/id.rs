@@ -68,6 +68,14 @@ id! {
     /// Names an upload that arrives in several requests.
     UploadId
 }
+id! {
+    /// Names an API key.
+    KeyId
+}
+id! {
+    /// Names a webhook of a project.
+    WebhookId
+}
 
 /// Counts the versions of a project's model: 1 is the first, and 0 the empty model before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default, Serialize, Deserialize)]

@@ -5,21 +5,25 @@
 mod decision;
 mod id;
 mod job;
+mod key;
 mod model;
 mod name;
 mod open_join;
 mod scan;
 mod settings;
 mod time;
+mod token;
 mod upload;
 
 pub use decision::{BadMotion, Decision, KeptDecision, Verdict, motion};
-pub use id::{BadId, DecisionId, JobId, ProjectId, ScanId, UploadId, VersionNumber};
+pub use id::{BadId, DecisionId, JobId, KeyId, ProjectId, ScanId, UploadId, VersionNumber, WebhookId};
 pub use job::{BadJobKind, Fault, Job, JobKind, JobState, Lane};
+pub use key::{Key, Limits, Reach, Scope};
 pub use model::{Component, Edge, ModelContent, Placement, Reason, Standing, Version};
 pub use name::{BadName, Name};
 pub use open_join::{OpenJoin, RivalPose, Undone};
 pub use scan::{BadInterpretation, ContentKey, Interpretation, Scan, ScanState};
 pub use settings::{BadSettings, Project, ProjectSettings};
 pub use time::Timestamp;
+pub use token::{BadToken, Digest, Token};
 pub use upload::{NewUpload, Upload, UploadEnd};

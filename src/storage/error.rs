@@ -1,6 +1,6 @@
 //! What can go wrong below the service.
 
-use crate::project::{DecisionId, JobId, ProjectId, ScanId, UploadId, VersionNumber};
+use crate::project::{DecisionId, JobId, KeyId, ProjectId, ScanId, UploadId, VersionNumber};
 
 /// A failure of the database or of the blob files.
 #[derive(Debug, thiserror::Error)]
@@ -30,6 +30,9 @@ pub enum StorageError {
         /// Bytes in its file.
         found: u64,
     },
+    /// No such key.
+    #[error("there is no key {0}")]
+    NoKey(KeyId),
     /// The project holds as many decisions as it may.
     #[error(
         "project {project} holds {limit} decisions, which is the limit; take back what no longer matters"

@@ -12,6 +12,7 @@ mod error;
 mod garbage;
 mod idempotency;
 mod job_rows;
+mod keys;
 #[cfg(test)]
 mod lease_tests;
 mod pins;
@@ -30,6 +31,7 @@ pub use derived::Owner;
 pub use error::StorageError;
 pub use idempotency::KeptAnswer;
 pub use job_rows::JobFilter;
+pub use keys::{Keys, NewKey};
 pub use pins::FreshBlob;
 pub use publication::{NewVersion, Publication, ScanChange};
 pub use scans::{Admission, NewScan};

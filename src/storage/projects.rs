@@ -6,7 +6,7 @@ use sqlx::sqlite::SqliteRow;
 use super::rows::{count, parsed, word};
 use super::{Page, StorageError, Store};
 use crate::control::Seed;
-use crate::project::{Name, Project, ProjectId, ProjectSettings, Timestamp, VersionNumber};
+use crate::project::{KeyId, Name, Project, ProjectId, ProjectSettings, Timestamp, VersionNumber};
 
 const SELECT: &str = "SELECT p.rowid AS position, p.*, (SELECT COUNT(*) FROM scans s WHERE s.project_id = p.id AND s.deleted_ms IS NULL) AS scans FROM projects p ";
 
@@ -48,14 +48,21 @@ impl Store {
         row.as_ref().map(project).transpose()?.ok_or(StorageError::NoProject(id))
     }
 
-    /// Projects, oldest first, each with its position in the list.
-    pub async fn projects(&self, page: Page) -> Result<Vec<(i64, Project)>, StorageError> {
-        let rows =
-            sqlx::query(sqlx::AssertSqlSafe(format!("{SELECT} WHERE p.rowid > ? ORDER BY p.rowid LIMIT ?")))
-                .bind(page.after.unwrap_or(0))
-                .bind(page.limit)
-                .fetch_all(&self.read)
-                .await?;
+    /// Projects, oldest first, each with its position in the list; with a key, only those that were granted to it one by one.
+    pub async fn projects(
+        &self,
+        page: Page,
+        granted_to: Option<KeyId>,
+    ) -> Result<Vec<(i64, Project)>, StorageError> {
+        let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
+            "{SELECT} WHERE p.rowid > ?1 AND (?2 IS NULL OR p.id IN (SELECT project_id FROM key_projects WHERE key_id = ?2))
+               ORDER BY p.rowid LIMIT ?3"
+        )))
+        .bind(page.after.unwrap_or(0))
+        .bind(granted_to.map(|key| key.to_string()))
+        .bind(page.limit)
+        .fetch_all(&self.read)
+        .await?;
         rows.iter().map(|row| Ok((row.try_get("position")?, project(row)?))).collect()
     }
 

@@ -15,7 +15,7 @@ use super::{BlobStore, StorageError, UploadFiles};
 use crate::project::JobId;
 
 /// How long a statement waits for a lock that another process holds, such as a backup.
-const BUSY: Duration = Duration::from_secs(10);
+pub(super) const BUSY: Duration = Duration::from_secs(10);
 /// Connections for readers; in WAL they never wait for the writer.
 const READERS: u32 = 4;
 /// Changes that a slow listener may lag behind; after that it reads the row again anyway.
@@ -34,7 +34,7 @@ pub struct Page {
 #[derive(Debug, Clone)]
 pub struct Store {
     pub(super) read: SqlitePool,
-    write: SqlitePool,
+    pub(super) write: SqlitePool,
     /// Content-addressed files.
     pub blobs: BlobStore,
     /// Uploads that are not complete.

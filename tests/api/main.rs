@@ -1,11 +1,13 @@
 //! The REST interface, tried from outside: a real server on a real database, over real HTTP.
 
+mod access;
 mod bad_files;
 mod decisions;
 mod description;
 mod downloads;
 mod idempotency;
 mod jobs;
+mod key_command;
 mod lifecycle;
 mod restore;
 mod server;

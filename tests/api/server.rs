@@ -1,6 +1,7 @@
 //! A service for one test, and the few calls that most tests make.
 
 use std::fmt::Write as _;
+use std::path::Path;
 use std::time::Duration;
 
 use cairn::app::{Running, start};
@@ -71,6 +72,11 @@ impl Server {
 
     pub async fn stop(self) {
         self.running.stop().await;
+    }
+
+    /// Its data directory.
+    pub fn data(&self) -> &Path {
+        self.data.path()
     }
 
     pub fn url(&self, path: &str) -> String {

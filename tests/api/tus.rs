@@ -126,7 +126,7 @@ async fn what_came_before_a_broken_connection_is_kept() {
         // Two thirds are announced, half of all comes, and the connection breaks.
         let mut raw = std::net::TcpStream::connect(server.url("").trim_start_matches("http://")).unwrap();
         let head = format!(
-            "PATCH {upload} HTTP/1.1\r\nhost: x\r\ntus-resumable: 1.0.0\r\nupload-offset: 0\r\n\
+            "PATCH {upload} HTTP/1.1\r\nhost: localhost\r\ntus-resumable: 1.0.0\r\nupload-offset: 0\r\n\
              content-type: application/offset+octet-stream\r\ncontent-length: {}\r\n\r\n",
             bytes.len() * 2 / 3
         );

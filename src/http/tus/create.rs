@@ -9,11 +9,12 @@ use super::append::detached;
 use super::headers::{BYTES, brings_bytes, bytes, continuation, standing, text};
 use super::metadata::parse_metadata;
 use super::version::Tus;
+use crate::http::access::Caller;
 use crate::http::download::Bytes;
 use crate::http::problem::{Problem, Problems};
 use crate::http::query::Params;
 use crate::http::router::Api;
-use crate::project::{NewUpload, Upload};
+use crate::project::{NewUpload, Scope, Upload};
 
 /// Announces an upload that will come in several requests (tus: creation, creation-with-upload). The metadata are the
 /// parameters of a direct upload and `project`. When the last byte has come, the upload is a scan like any other: the
@@ -43,6 +44,7 @@ use crate::project::{NewUpload, Upload};
 pub(super) async fn create_upload(
     _: Tus,
     State(api): State<Api>,
+    caller: Caller,
     query: Params,
     headers: HeaderMap,
     body: Body,
@@ -51,6 +53,7 @@ pub(super) async fn create_upload(
     let length = length(&headers)?;
     let metadata = text(&headers, "upload-metadata")?.unwrap_or("");
     let parsed = parse_metadata(metadata)?;
+    caller.admit(Scope::Upload, parsed.project)?;
     let with_bytes = brings_bytes(&headers);
     if !with_bytes && !body.is_end_stream() {
         return Err(wrong_type());
