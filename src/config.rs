@@ -7,7 +7,7 @@ use std::time::Duration;
 use clap::Args;
 use serde::Deserialize;
 
-use crate::jobs::WorkerOptions;
+use crate::jobs::{Isolated, Isolation, WorkerOptions};
 
 /// Every setting, each possibly not given. The same names serve as flags, in the environment and in the file.
 #[derive(Debug, Clone, Default, PartialEq, Args, Deserialize)]
@@ -49,6 +49,21 @@ pub struct Settings {
     /// Serve requests without a key, whoever sends them [default: false]
     #[arg(long, env = "CAIRN_ALLOW_ANONYMOUS", value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     pub allow_anonymous: Option<bool>,
+    /// Memory that the process of one job may use, bytes [default: three quarters of the machine's]
+    #[arg(long, env = "CAIRN_WORKER_MEMORY_BYTES", value_name = "BYTES")]
+    pub worker_memory_bytes: Option<u64>,
+    /// Seconds that a job may take [default: 7200]
+    #[arg(long, env = "CAIRN_JOB_SECONDS", value_name = "SECONDS")]
+    pub job_seconds: Option<u64>,
+    /// Which jobs get a process of their own: never, suspects (a process died of them before), uploads (these, and all that read
+    /// an upload for the first time) [default: uploads]
+    #[arg(long, env = "CAIRN_ISOLATION", value_name = "WHICH")]
+    pub isolation: Option<Isolation>,
+    /// This program, if it may be started again for jobs that need a process of their own. No setting: whoever runs the service
+    /// says so.
+    #[arg(skip)]
+    #[serde(skip)]
+    pub program: Option<PathBuf>,
     /// Write logs as JSON [default: false]
     #[arg(long, env = "CAIRN_LOG_JSON", value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     pub log_json: Option<bool>,
@@ -138,6 +153,10 @@ impl Settings {
             upload_expiry_hours: self.upload_expiry_hours.or(other.upload_expiry_hours),
             batch: self.batch.or(other.batch),
             allow_anonymous: self.allow_anonymous.or(other.allow_anonymous),
+            worker_memory_bytes: self.worker_memory_bytes.or(other.worker_memory_bytes),
+            job_seconds: self.job_seconds.or(other.job_seconds),
+            isolation: self.isolation.or(other.isolation),
+            program: self.program.or(other.program),
             log_json: self.log_json.or(other.log_json),
         }
     }
@@ -149,6 +168,19 @@ impl Settings {
         let seconds = |setting, given: Option<u64>, default| {
             Ok(Duration::from_secs(within(setting, given.unwrap_or(default), 1, 86_400)?))
         };
+        let memory_bytes = within(
+            "worker-memory-bytes",
+            self.worker_memory_bytes.unwrap_or_else(|| machine_memory() / 4 * 3),
+            LEAST_MEMORY,
+            i64::MAX as u64,
+        )?;
+        let max_points = within("max-points", self.max_points.unwrap_or(200_000_000), 1, u32::MAX.into())?;
+        let isolated = self.program.map(|program| Isolated {
+            which: self.isolation.unwrap_or_default(),
+            program,
+            threads: threads as usize,
+            log_json: self.log_json.unwrap_or(false),
+        });
         Ok(Config {
             listen: self.listen.unwrap_or_else(|| SocketAddr::from(([127, 0, 0, 1], 8080))),
             data: self.data.unwrap_or_else(|| PathBuf::from(DEFAULT_DATA)),
@@ -172,7 +204,10 @@ impl Settings {
                 poll: seconds("poll-seconds", self.poll_seconds, 2)?,
                 progress_every: Duration::from_millis(250),
                 batch: within("batch", self.batch.unwrap_or(32).into(), 1, 1000)? as u32,
-                max_points: within("max-points", self.max_points.unwrap_or(200_000_000), 1, u32::MAX.into())?,
+                max_points: max_points.min(memory_bytes / BYTES_PER_POINT),
+                memory_bytes,
+                job_limit: seconds("job-seconds", self.job_seconds, 7200)?,
+                isolated,
                 collect_every: Duration::from_secs(10),
                 grace: Duration::from_secs(20),
             },
@@ -180,6 +215,19 @@ impl Settings {
             log_json: self.log_json.unwrap_or(false),
         })
     }
+}
+
+/// What a worker needs at least, whatever it works on, bytes.
+const LEAST_MEMORY: u64 = 256 << 20;
+/// What decoding and preparing a scan takes at its peak, bytes for a point (measured, see docs/operations.md).
+const BYTES_PER_POINT: u64 = 120;
+
+/// Memory of this machine, bytes; 8 GiB where it is not told.
+fn machine_memory() -> u64 {
+    let info = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let line = info.lines().find_map(|line| line.strip_prefix("MemTotal:"));
+    let kib: Option<u64> = line.and_then(|line| line.trim().trim_end_matches(" kB").parse().ok());
+    kib.map_or(8 << 30, |kib| kib * 1024).max(LEAST_MEMORY * 2)
 }
 
 fn within(setting: &'static str, value: u64, least: u64, most: u64) -> Result<u64, ConfigError> {

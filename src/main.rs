@@ -4,7 +4,9 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use cairn::cli::{bench, calibrate, demo, evaluate, key, openapi, register, serve, simulate};
+use cairn::cli::{
+    backup, bench, calibrate, check, demo, evaluate, key, openapi, register, serve, simulate, work,
+};
 
 /// Fits many 3-D scans of one place into one model
 #[derive(Debug, Parser)]
@@ -20,11 +22,16 @@ enum Command {
     Key(key::KeyArgs),
     Register(register::RegisterArgs),
     Demo(demo::DemoArgs),
+    Check(check::CheckArgs),
+    Backup(backup::BackupArgs),
+    Restore(backup::RestoreArgs),
     Evaluate(evaluate::EvaluateArgs),
     Bench(bench::BenchArgs),
     Simulate(simulate::SimulateArgs),
     Calibrate(calibrate::CalibrateArgs),
     Openapi(openapi::OpenapiArgs),
+    #[command(hide = true)]
+    Work(work::WorkArgs),
 }
 
 fn main() -> ExitCode {
@@ -40,11 +47,15 @@ fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Key(args) => key::run(args)?,
         Command::Register(args) => return register::run(&args),
         Command::Demo(args) => return demo::run(&args),
+        Command::Check(args) => return check::run(&args),
+        Command::Backup(args) => return backup::run(&args),
+        Command::Restore(args) => return backup::run_restore(&args),
         Command::Evaluate(args) => evaluate::run(&args)?,
         Command::Bench(args) => return bench::run(&args),
         Command::Simulate(args) => simulate::run(&args)?,
         Command::Calibrate(args) => return calibrate::run(&args),
         Command::Openapi(args) => openapi::run(args)?,
+        Command::Work(args) => return work::run(&args),
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -1,7 +1,9 @@
 //! The command line: one file or folder a subcommand.
 
+pub mod backup;
 pub mod bench;
 pub mod calibrate;
+pub mod check;
 pub mod demo;
 pub mod evaluate;
 pub mod key;
@@ -12,3 +14,4 @@ pub mod serve;
 mod signals;
 pub mod simulate;
 mod truth;
+pub mod work;

@@ -23,7 +23,7 @@ pub struct ServeArgs {
 /// Serves until SIGINT or SIGTERM, then shuts down softly; a second signal ends the process at once.
 pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     let file = args.config.as_deref().map(Settings::from_file).transpose()?.unwrap_or_default();
-    let config = args.settings.or(file).resolve()?;
+    let config = Settings { program: Some(this_program()), ..args.settings.or(file) }.resolve()?;
     telemetry::init(config.log_json)?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
@@ -33,6 +33,12 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
         running.wait().await;
         Ok(())
     })
+}
+
+/// This very program, even if its file was replaced since it started.
+pub(super) fn this_program() -> PathBuf {
+    let running = PathBuf::from("/proc/self/exe");
+    if running.exists() { running } else { std::env::current_exe().unwrap_or(running) }
 }
 
 async fn stop_on_signal(stop: CancellationToken) {

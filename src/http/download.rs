@@ -1,4 +1,5 @@
-//! Files for download: strong ETags, conditional and partial requests (RFC 9110), streamed from the blob.
+//! Files for download: strong ETags, conditional and partial requests (RFC 9110), streamed from the blob once it is known to be
+//! sound.
 
 use std::io::{ErrorKind, SeekFrom};
 
@@ -82,6 +83,8 @@ async fn body(
     length: u64,
     status: StatusCode,
 ) -> Result<Response, Problem> {
+    let (checked, id) = (blobs.clone(), blob.id);
+    tokio::task::spawn_blocking(move || checked.verify(id)).await.map_err(Problem::internal)??;
     let mut file = tokio::fs::File::open(blobs.path(blob.id)).await.map_err(|error| match error.kind() {
         // Its row was there a moment ago: whom it belongs to was deleted meanwhile.
         ErrorKind::NotFound => Problem::not_found("the file was deleted"),

@@ -14,20 +14,24 @@ pub(super) async fn healthz() -> &'static str {
     "ok\n"
 }
 
-/// Says whether requests make sense now: the database can be read, and the service is not stopping.
+/// Says whether requests make sense now: the database can be read, and the service is not stopping. If stored files are damaged
+/// that could not be made again, it says how many; `cairn check` names them.
 #[utoipa::path(get, path = "/readyz", tag = "service", responses(
     (status = 200, description = "It is ready", body = String, content_type = "text/plain"),
     (status = 503, description = "It is stopping, or cannot read its data", body = Problem, content_type = "application/problem+json")))]
-pub(super) async fn readyz(State(api): State<Api>) -> Result<&'static str, Problem> {
+pub(super) async fn readyz(State(api): State<Api>) -> Result<String, Problem> {
     let not_ready = |detail| Problem::new(StatusCode::SERVICE_UNAVAILABLE, "not-ready", detail);
     if api.stop.is_cancelled() {
         return Err(not_ready("the service is stopping"));
     }
-    api.store.ping().await.map_err(|error| {
+    let damage = api.store.damage().await.map_err(|error| {
         tracing::error!(%error, "the database cannot be read");
         not_ready("the service cannot read its data")
     })?;
-    Ok("ready\n")
+    Ok(match damage.len() {
+        0 => "ready\n".to_owned(),
+        n => format!("ready, but {n} stored files are damaged; cairn check names them\n"),
+    })
 }
 
 /// The description of this interface.

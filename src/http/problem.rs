@@ -7,7 +7,7 @@ use utoipa::{IntoResponses, ToSchema};
 
 use crate::jobs::{ExportError, IntakeError};
 use crate::project::{Fault, JobState};
-use crate::storage::StorageError;
+use crate::storage::{StorageError, Trouble};
 
 /// What went wrong with a request, for people (`title`, `detail`) and for programs (`type`, `field`, `limit`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -43,6 +43,12 @@ pub(super) enum Problems {
     /// The service failed; the details are in its log, under the request id.
     #[response(status = 500, content_type = "application/problem+json")]
     Internal(#[to_schema] Problem),
+    /// Its files or its database cannot be used just now; try again after `retry-after`.
+    #[response(status = 503, content_type = "application/problem+json")]
+    Unavailable(#[to_schema] Problem),
+    /// It has no space left; nothing was changed.
+    #[response(status = 507, content_type = "application/problem+json")]
+    InsufficientStorage(#[to_schema] Problem),
 }
 
 impl Problem {
@@ -78,6 +84,28 @@ impl Problem {
         )
     }
 
+    /// The machine lacks something, and may have it again soon.
+    fn unavailable(trouble: Trouble, cause: &StorageError) -> Self {
+        tracing::error!(%cause, "a request could not be served");
+        match trouble {
+            Trouble::Full => Self::new(
+                StatusCode::INSUFFICIENT_STORAGE,
+                "insufficient-storage",
+                "the service has no space left for this; nothing was changed, and it works again when there is space",
+            ),
+            Trouble::Busy => Self::new(
+                StatusCode::SERVICE_UNAVAILABLE,
+                "busy",
+                "the service's database is held by another process; try again",
+            ),
+            Trouble::Failing => Self::new(
+                StatusCode::SERVICE_UNAVAILABLE,
+                "storage-failing",
+                "the service cannot read or write its files just now; nothing was changed",
+            ),
+        }
+    }
+
     /// Why a job failed, in the same form as every other error.
     #[must_use]
     pub fn of_fault(fault: &Fault) -> Self {
@@ -99,6 +127,9 @@ impl IntoResponse for Problem {
             response
                 .headers_mut()
                 .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"cairn\""));
+        }
+        if matches!(status, StatusCode::SERVICE_UNAVAILABLE | StatusCode::INSUFFICIENT_STORAGE) {
+            response.headers_mut().entry(header::RETRY_AFTER).or_insert(HeaderValue::from_static("5"));
         }
         response
     }
@@ -130,7 +161,12 @@ impl From<StorageError> for Problem {
             StorageError::DamagedUpload { .. } => {
                 Self::new(StatusCode::GONE, "upload-lost", format!("{error}; begin it anew"))
             }
-            other => Self::internal(other),
+            // Its row was there a moment ago: whom it belongs to was deleted meanwhile, or the file is lost, which the log tells.
+            StorageError::MissingBlob(_) => Self::not_found("the file is not there"),
+            error => match error.trouble() {
+                Some(trouble) => Self::unavailable(trouble, &error),
+                None => Self::internal(error),
+            },
         }
     }
 }

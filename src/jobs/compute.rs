@@ -2,7 +2,7 @@
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError, RwLock};
 
 use tokio::sync::oneshot;
 
@@ -14,17 +14,23 @@ pub struct Panicked(pub String);
 /// The thread pool of all computations. Clones share it.
 #[derive(Debug, Clone)]
 pub struct Compute {
-    pool: Arc<rayon::ThreadPool>,
+    threads: usize,
+    pool: Arc<RwLock<Arc<rayon::ThreadPool>>>,
 }
 
 impl Compute {
     /// Starts `threads` threads; 0 is one for each core.
     pub fn new(threads: usize) -> Result<Self, rayon::ThreadPoolBuildError> {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .thread_name(|i| format!("compute-{i}"))
-            .build()?;
-        Ok(Self { pool: Arc::new(pool) })
+        Ok(Self { threads, pool: Arc::new(RwLock::new(Arc::new(build(threads)?))) })
+    }
+
+    /// Starts new threads for what is computed from now on, because a computation does not stop. What runs in the old ones goes on;
+    /// those that are free end when it has.
+    pub fn renew(&self) {
+        match build(self.threads) {
+            Ok(pool) => *self.pool.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(pool),
+            Err(error) => tracing::error!(%error, "no new threads could be started"),
+        }
     }
 
     /// Runs `work` in the pool and waits for it without blocking an async thread. Dropping the future does not stop
@@ -34,13 +40,29 @@ impl Compute {
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Panicked> {
         let (sender, receiver) = oneshot::channel();
-        self.pool.spawn(move || {
+        let pool = Arc::clone(&self.pool.read().unwrap_or_else(PoisonError::into_inner));
+        pool.spawn(move || {
             let result = catch_unwind(AssertUnwindSafe(work)).map_err(|p| Panicked(message(p.as_ref())));
             // An error only says that nobody waits for the result any more.
             let _ = sender.send(result);
         });
         receiver.await.unwrap_or_else(|_| Err(Panicked("the thread pool is gone".to_owned())))
     }
+}
+
+fn build(threads: usize) -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildError> {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .thread_name(|i| format!("compute-{i}"))
+        .start_handler(|_| yield_to_clients())
+        .build()
+}
+
+/// Lets those who answer clients go first: this thread, and those that it starts, get what they leave. On Linux, where niceness is a
+/// thread's; elsewhere it does as much as the system allows.
+pub fn yield_to_clients() {
+    // Being refused only means that answers are slower while much is computed.
+    let _ = rustix::process::nice(10);
 }
 
 /// What a panic said, if it said it in words.
@@ -52,6 +74,21 @@ fn message(payload: &(dyn Any + Send)) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn a_computation_that_does_not_end_does_not_keep_others_waiting() {
+        let compute = Compute::new(1).unwrap();
+        let (release, stuck) = std::sync::mpsc::channel::<()>();
+        let endless = tokio::spawn({
+            let compute = compute.clone();
+            async move { compute.run(move || stuck.recv().is_err()).await }
+        });
+        tokio::task::yield_now().await;
+        compute.renew();
+        assert_eq!(compute.run(|| 6 * 7).await, Ok(42));
+        drop(release);
+        assert_eq!(endless.await.unwrap(), Ok(true));
+    }
 
     #[tokio::test]
     async fn a_panic_fails_the_computation_and_the_pool_lives_on() {

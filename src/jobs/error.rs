@@ -6,7 +6,10 @@ use crate::control::Cancelled;
 use crate::features::PrepareError;
 use crate::mapping::RestoreError;
 use crate::project::Fault;
-use crate::storage::StorageError;
+use crate::storage::{Retry, StorageError};
+
+/// The code of faults that come of damaged data on our own disk.
+pub(super) const DAMAGED: &str = "damaged-data";
 
 /// Why a job stops before its end.
 #[derive(Debug, thiserror::Error)]
@@ -23,7 +26,7 @@ pub enum JobError {
         /// What the client is told.
         fault: Fault,
         /// Whether another attempt may go better.
-        retry: bool,
+        retry: Retry,
     },
 }
 
@@ -35,7 +38,10 @@ impl JobError {
         reason = "an error ends here, and `map_err` hands it over whole"
     )]
     pub fn for_good(code: &str, detail: impl ToString) -> Self {
-        Self::Failed { fault: Fault { code: code.to_owned(), detail: detail.to_string() }, retry: false }
+        Self::Failed {
+            fault: Fault { code: code.to_owned(), detail: detail.to_string() },
+            retry: Retry::Never,
+        }
     }
 
     /// A failure that may pass.
@@ -45,7 +51,10 @@ impl JobError {
         reason = "an error ends here, and `map_err` hands it over whole"
     )]
     pub fn for_now(code: &str, detail: impl ToString) -> Self {
-        Self::Failed { fault: Fault { code: code.to_owned(), detail: detail.to_string() }, retry: true }
+        Self::Failed {
+            fault: Fault { code: code.to_owned(), detail: detail.to_string() },
+            retry: Retry::AFewTimes,
+        }
     }
 }
 
@@ -53,13 +62,15 @@ impl From<StorageError> for JobError {
     fn from(error: StorageError) -> Self {
         match error {
             StorageError::Fenced { .. } | StorageError::NoProject(_) | StorageError::NoJob(_) => Self::Lost,
-            StorageError::MissingBlob(_) | StorageError::DamagedBlob { .. } => {
-                Self::for_good("damaged-data", error)
-            }
+            error if error.is_damage() => Self::for_good(DAMAGED, error),
             // The text goes to clients: what exactly failed is for the log only.
             other => {
                 tracing::error!(error = %other, "storage failed under a job");
-                Self::for_now("storage", "the service could not read or write its data")
+                let detail = "the service could not read or write its data".to_owned();
+                let fault = Fault { code: "storage".to_owned(), detail };
+                // Trouble of the machine is not the job's doing.
+                let retry = other.trouble().map_or(Retry::AFewTimes, |_| Retry::UntilItPasses);
+                Self::Failed { fault, retry }
             }
         }
     }
@@ -92,6 +103,6 @@ impl From<PrepareError> for JobError {
 
 impl From<RestoreError> for JobError {
     fn from(error: RestoreError) -> Self {
-        Self::for_good("damaged-data", error)
+        Self::for_good(DAMAGED, error)
     }
 }

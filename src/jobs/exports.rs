@@ -119,17 +119,33 @@ impl Exports {
         key: blake3::Hash,
         make: impl FnOnce() -> Result<FreshBlob, ExportError> + Send + 'static,
     ) -> Result<StoredBlob, ExportError> {
-        if let Some(found) = self.store.derived(&key).await? {
+        if let Some(found) = self.remembered(&key).await? {
             return Ok(found);
         }
         let _turn = self.building.lock().await;
         // Whoever was before us may have made it.
-        if let Some(found) = self.store.derived(&key).await? {
+        if let Some(found) = self.remembered(&key).await? {
             return Ok(found);
         }
         let fresh = self.compute.run(make).await??;
         self.store.remember(&key, Owner { project, scan: None }, &fresh).await?;
         Ok(*fresh)
+    }
+
+    /// The remembered file, if it is sound: one that is not is made again.
+    async fn remembered(&self, key: &blake3::Hash) -> Result<Option<StoredBlob>, ExportError> {
+        let Some(found) = self.store.derived(key).await? else { return Ok(None) };
+        let blobs = self.store.blobs.clone();
+        let verified = tokio::task::spawn_blocking(move || blobs.verify(found.id))
+            .await
+            .map_err(|e| Panicked(e.to_string()))?;
+        match verified {
+            Ok(()) => Ok(Some(found)),
+            Err(error) => {
+                tracing::warn!(%error, "an export is damaged and is made again");
+                Ok(None)
+            }
+        }
     }
 
     /// The scans that take part, in order of arrival. Deleted ones do not: their uploads are gone.

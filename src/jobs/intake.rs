@@ -106,7 +106,7 @@ impl Intake {
             return Err(IntakeError::TooLarge { limit });
         }
         self.store.project(request.project).await?;
-        let mut writer = self.store.blobs.writer().await?;
+        let mut writer = self.store.blobs.writer();
         let mut head = Vec::new();
         let mut format = None;
         let mut check = DigestCheck::new(request.digests);

@@ -4,6 +4,7 @@
 //! Uses `storage` for all state and the core for all computation; `http` calls [`Intake`] and [`Exports`], `app` runs
 //! the [`Workers`]. The only bridge from tokio to rayon is in `compute`.
 
+mod audit;
 mod compute;
 mod content;
 mod decide;
@@ -12,10 +13,12 @@ mod error;
 mod exports;
 mod ingest;
 mod intake;
+mod isolated;
 mod merge;
 mod model_cache;
 mod originals;
 mod parameters;
+mod perform;
 mod picture;
 mod prepared;
 mod progress;
@@ -31,11 +34,13 @@ mod turnstile;
 mod workers;
 
 pub use crate::cloud::metres_per_unit;
-pub use compute::{Compute, Panicked};
+pub use audit::undecodable;
+pub use compute::{Compute, Panicked, yield_to_clients};
 pub use digest::{DigestAlgorithm, DigestMismatch, ExpectedDigest};
 pub use error::JobError;
 pub use exports::{CloudRequest, ComponentChoice, ExportError, Exports};
 pub use intake::{Intake, IntakeError, UploadRequest};
+pub use isolated::{Isolated, Isolation, NOT_NOW, work_alone};
 pub use parameters::DECIDING_SCANS;
 pub use reason::{reason_of, reason_of_refusal};
 pub use resumable::{Continuation, Resumable, ResumableError};

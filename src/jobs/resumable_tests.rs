@@ -309,7 +309,7 @@ async fn a_death_between_the_blob_and_its_scan_loses_nothing() {
     let stored = service.store.uploads.hash(id).await.unwrap();
     drop(service.store.settle_upload(id, stored).await.unwrap());
     let service = service.restart().await;
-    service.store.collect_garbage().await.unwrap();
+    service.store.collect_garbage(Duration::ZERO).await.unwrap();
     assert_eq!(
         service.uploads.peek(id).await.unwrap().received,
         500,

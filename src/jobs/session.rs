@@ -7,6 +7,7 @@ use serde_json::Value;
 
 use super::content::{content_of, edges_of};
 use super::decide::engine_decisions;
+use super::error::DAMAGED;
 use super::model_cache::ModelCache;
 use super::parameters::{Parameters, content_key, scan_key};
 use super::prepared::prepare_all;
@@ -21,7 +22,7 @@ use crate::project::{
     ContentKey, Fault, JobId, KeptDecision, ModelContent, Project, ProjectId, Scan, ScanId, Standing,
     VersionNumber,
 };
-use crate::storage::{BlobId, Claim, NewVersion, Publication, ScanChange, Store};
+use crate::storage::{BlobId, Claim, NewVersion, Publication, Retry, ScanChange, Store, pack};
 
 /// What a job may use.
 pub(super) struct Task {
@@ -54,7 +55,7 @@ pub(super) struct Session {
     pub model: LiveModel,
     /// The version that the job starts from, as readers see it.
     pub before: ModelContent,
-    /// Hash of that version's snapshot.
+    /// Hash of that version's snapshot, if both can be read.
     snapshot_before: Option<BlobId>,
     /// What clients had decided when the job opened the model …
     kept: Vec<KeptDecision>,
@@ -93,24 +94,51 @@ impl Session {
         let snapshot = BlobId::parse(&version.snapshot)?;
         session.parameters = parameters;
         session.snapshot_before = Some(snapshot);
-        (_, session.before) = task.store.content(session.project.id, Some(session.project.head)).await?;
+        session.read_before(task, version.resolution).await?;
         if engine != parameters.engine() {
             // Another engine made this model: what it stored means nothing to this one.
             session.remake(task, parameters, Vec::new()).await?;
         } else if let Some(model) = task.models.get(session.project.id, session.project.head) {
             session.model = model;
         } else {
-            session.restore(task, snapshot).await?;
+            match session.restore(task, snapshot).await {
+                Err(JobError::Failed { fault, .. }) if fault.code == DAMAGED => {
+                    // The uploads are what counts; all else follows from them.
+                    tracing::warn!(
+                        detail = fault.detail,
+                        "the newest version is damaged; the model is made anew"
+                    );
+                    session.snapshot_before = None;
+                    session.remake(task, parameters, Vec::new()).await?;
+                }
+                other => other?,
+            }
         }
         Ok(session)
+    }
+
+    /// Reads the newest version as readers see it. If that is damaged, the rows of its scans tell enough to go on, and a new version
+    /// is published whatever becomes of the model.
+    async fn read_before(&mut self, task: &Task, resolution: f64) -> Result<(), JobError> {
+        let project = self.project.id;
+        self.before = match task.store.content(project, Some(self.project.head)).await {
+            Ok((_, content)) => content,
+            Err(error) if error.is_damage() => {
+                tracing::warn!(%error, "what readers see of the newest version is damaged; it is written anew");
+                self.snapshot_before = None;
+                let scans = task.store.standings(project).await?;
+                ModelContent { resolution, scans, ..ModelContent::default() }
+            }
+            Err(error) => return Err(error.into()),
+        };
+        Ok(())
     }
 
     /// Reads the model back from its snapshot, its prepared scans and its pairs.
     async fn restore(&mut self, task: &Task, snapshot: BlobId) -> Result<(), JobError> {
         let blobs = task.store.blobs.clone();
         let bytes = task.compute(move |_| blobs.get(snapshot)).await??;
-        let snapshot =
-            ModelSnapshot::from_bytes(&bytes).map_err(|e| JobError::for_good("damaged-data", e))?;
+        let snapshot = ModelSnapshot::from_bytes(&bytes).map_err(|e| JobError::for_good(DAMAGED, e))?;
         let by_key = scans_by_key(task, self.project.id).await?;
         let known: Vec<Scan> =
             snapshot.scans.keys().filter_map(|key| by_key.get(&content_key(*key)).cloned()).collect();
@@ -124,7 +152,7 @@ impl Session {
                 let mut pairs = Vec::with_capacity(rows.len());
                 for row in rows {
                     let result: PairResult =
-                        postcard::from_bytes(&row).map_err(|e| JobError::for_good("damaged-data", e))?;
+                        postcard::from_bytes(&row).map_err(|e| JobError::for_good(DAMAGED, e))?;
                     if known(result.pair.a) && known(result.pair.b) {
                         pairs.push(result);
                     }
@@ -160,7 +188,7 @@ impl Session {
         for (scan, prepared) in scans.iter().zip(all) {
             match prepared {
                 Ok(prepared) => fit.push(prepared),
-                Err(JobError::Failed { fault, retry: false }) => self.unfit.push((scan.id, fault)),
+                Err(JobError::Failed { fault, retry: Retry::Never }) => self.unfit.push((scan.id, fault)),
                 Err(other) => return Err(other),
             }
         }
@@ -196,6 +224,7 @@ impl Session {
         let by_key = scans_by_key(task, self.project.id).await?;
         let blobs = task.store.blobs.clone();
         let (parameters, old) = (self.parameters, self.snapshot_before);
+        let first = self.project.head == VersionNumber::EMPTY;
         let decisions = self.kept.iter().map(|kept| (kept.id, kept.decision)).collect();
         let (model, written, pairs) = {
             let empty = LiveModel::new(self.options());
@@ -208,13 +237,11 @@ impl Session {
                 let mut content = content_of(&snapshot, &by_key, parameters.resolution);
                 content.edges = edges_of(model.graph(), &content, &by_key);
                 content.decisions = decisions;
-                let nothing = old.is_none() && content.scans.is_empty();
+                let nothing = first && content.scans.is_empty();
                 if nothing || old == Some(stored.id) {
                     return Ok((model, None, pairs));
                 }
-                let bytes =
-                    serde_json::to_vec(&content).map_err(|e| JobError::for_good("internal-error", e))?;
-                let readable = blobs.put(&bytes)?;
+                let readable = blobs.put(&pack(&content)?)?;
                 Ok((model, Some((stored, readable, content)), pairs))
             })
             .await??

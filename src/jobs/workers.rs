@@ -1,6 +1,5 @@
-//! The worker pool: loops that claim a job, do it, and watch the claim while it runs.
+//! The worker pool: loops that claim jobs and have them done (see `perform`), and those that keep the store in order.
 
-use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,17 +7,10 @@ use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::decide::decide;
-use super::ingest::ingest;
-use super::model_cache::ModelCache;
-use super::progress::ProgressSink;
-use super::refine::refine;
-use super::register::register;
-use super::remove::remove;
-use super::session::Task;
-use super::{Compute, JobError};
-use crate::control::CancelToken;
-use crate::project::{JobKind, Lane};
+use super::Compute;
+use super::isolated::{Isolated, Isolation};
+use super::perform::{PATIENCE, Performer};
+use crate::project::Lane;
 use crate::storage::{Claim, StorageError, Store};
 
 /// How the pool works.
@@ -36,11 +28,24 @@ pub struct WorkerOptions {
     pub batch: u32,
     /// Points that one scan may have.
     pub max_points: u64,
+    /// Memory that the process of one job may use, bytes.
+    pub memory_bytes: u64,
+    /// How long a job may take.
+    pub job_limit: Duration,
+    /// Which jobs get a process of their own, and how; `None`: none.
+    pub isolated: Option<Isolated>,
     /// How often files are deleted that nothing needs any more.
     pub collect_every: Duration,
     /// How long a stopping worker is waited for.
     pub grace: Duration,
 }
+
+/// How often the folder of blobs is walked for files that nothing names; the first time at the start.
+const WALK_EVERY: Duration = Duration::from_hours(24);
+/// How old such a file must be. Whatever is younger may belong to a row that is about to be committed.
+const ORPHAN_AGE: Duration = Duration::from_hours(1);
+/// How long blobs are spared that a process of a job has stored: so long it may take to commit their rows.
+const FRESH: Duration = Duration::from_mins(10);
 
 /// The running pool.
 #[derive(Debug)]
@@ -50,25 +55,27 @@ pub struct Workers {
     grace: Duration,
 }
 
-struct Pool {
-    store: Store,
-    compute: Compute,
-    models: Arc<ModelCache>,
-    options: WorkerOptions,
-    stop: CancellationToken,
-}
+struct Pool(Performer);
 
 impl Workers {
     /// Takes back what a dead process left claimed, then starts the loops.
     pub async fn start(store: Store, compute: Compute, options: WorkerOptions) -> Result<Self, StorageError> {
-        let left = store.reclaim(true).await?;
+        let left = store.reclaim(true, isolates(&options)).await?;
         if left > 0 {
             tracing::info!(jobs = left, "jobs of a process that ended are taken up again");
         }
         let stop = CancellationToken::new();
         let grace = options.grace;
         let workers = options.workers.max(1);
-        let pool = Arc::new(Pool { store, compute, models: Arc::default(), options, stop: stop.clone() });
+        let models = Arc::default();
+        let pool = Arc::new(Pool(Performer {
+            store,
+            compute,
+            models,
+            options,
+            stop: stop.clone(),
+            patience: PATIENCE,
+        }));
         let mut loops = JoinSet::new();
         for index in 0..workers {
             let pool = Arc::clone(&pool);
@@ -93,7 +100,7 @@ impl Workers {
 
 impl Pool {
     async fn work(&self, worker: &str) {
-        while !self.stop.is_cancelled() {
+        while !self.0.stop.is_cancelled() {
             match self.claim(worker).await {
                 Ok(Some((lane, claim))) => {
                     let span = tracing::info_span!("job", job = %claim.job.id, kind = %claim.job.kind,
@@ -111,32 +118,40 @@ impl Pool {
 
     /// Mapping first: it is what clients wait for, and only one worker a project can be at it.
     async fn claim(&self, worker: &str) -> Result<Option<(Lane, Claim)>, StorageError> {
+        let (store, options) = (&self.0.store, &self.0.options);
         for lane in [Lane::Map, Lane::Ingest] {
-            let batch = self.options.batch;
-            if let Some(claim) = self.store.claim(lane, worker, self.options.lease, batch).await? {
+            let isolated = isolates(options);
+            if let Some(claim) = store.claim(lane, worker, options.lease, options.batch, isolated).await? {
                 return Ok(Some((lane, claim)));
             }
         }
         Ok(None)
     }
 
+    async fn perform(&self, lane: Lane, claim: Claim) {
+        match self.0.isolates(lane, &claim) {
+            Some(isolated) => self.0.perform_isolated(isolated, lane, claim).await,
+            None => self.0.perform(lane, claim).await,
+        }
+    }
+
     async fn idle(&self) {
         tokio::select! {
-            () = self.store.work() => {}
-            () = tokio::time::sleep(self.options.poll) => {}
-            () = self.stop.cancelled() => {}
+            () = self.0.store.work() => {}
+            () = tokio::time::sleep(self.0.options.poll) => {}
+            () = self.0.stop.cancelled() => {}
         }
     }
 
     /// Takes back claims whose lease ran out.
     async fn sweep(&self) {
-        let mut tick = tokio::time::interval(self.options.lease / 2);
+        let mut tick = tokio::time::interval(self.0.options.lease / 2);
         loop {
             tokio::select! {
                 _ = tick.tick() => {}
-                () = self.stop.cancelled() => return,
+                () = self.0.stop.cancelled() => return,
             }
-            match self.store.reclaim(false).await {
+            match self.0.store.reclaim(false, isolates(&self.0.options)).await {
                 Ok(0) => {}
                 Ok(jobs) => tracing::warn!(jobs, "leases ran out; the jobs are queued again"),
                 Err(error) => tracing::error!(%error, "leases cannot be checked"),
@@ -144,99 +159,36 @@ impl Pool {
         }
     }
 
-    /// Deletes files that nothing needs any more, from time to time: nobody waits for it.
+    /// Deletes files that nothing needs any more and sees to damaged ones, from time to time: nobody waits for it.
     async fn collect(&self) {
-        let mut tick = tokio::time::interval(self.options.collect_every);
+        let mut tick = tokio::time::interval(self.0.options.collect_every);
+        let mut walk = tokio::time::interval(WALK_EVERY);
+        let spared = if self.0.options.isolated.is_some() { FRESH } else { Duration::ZERO };
         loop {
             tokio::select! {
                 _ = tick.tick() => {}
-                () = self.stop.cancelled() => return,
+                _ = walk.tick() => {
+                    match self.0.store.note_orphans(ORPHAN_AGE).await {
+                        Ok(0) => {}
+                        Ok(files) => tracing::info!(files, "files that a crash left behind are found"),
+                        Err(error) => tracing::error!(%error, "files that a crash left behind cannot be looked for"),
+                    }
+                }
+                () = self.0.stop.cancelled() => return,
             }
-            match self.store.collect_garbage().await {
+            if let Err(error) = self.0.store.settle_damage().await {
+                tracing::error!(%error, "damage cannot be written down");
+            }
+            match self.0.store.collect_garbage(spared).await {
                 Ok(0) => {}
                 Ok(blobs) => tracing::info!(blobs, "files that nothing needs any more are deleted"),
                 Err(error) => tracing::error!(%error, "garbage cannot be collected"),
             }
         }
     }
-
-    async fn perform(&self, lane: Lane, claim: Claim) {
-        let lease = claim.lease.clone();
-        let task = Task {
-            progress: Arc::new(ProgressSink::new(claim.job.kind, lane)),
-            cancel: CancelToken::new(),
-            store: self.store.clone(),
-            compute: self.compute.clone(),
-            models: Arc::clone(&self.models),
-            options: self.options.clone(),
-            claim,
-        };
-        tracing::info!(lane = lane.as_str(), batch = 1 + lease.members.len(), "job begins");
-        let result = {
-            let mut run = pin!(run(lane, &task));
-            tokio::select! {
-                result = &mut run => result,
-                () = self.keep(&task) => {
-                    // The core looks at the token every few tens of milliseconds.
-                    task.cancel.cancel();
-                    run.await
-                }
-            }
-        };
-        let ended = match result {
-            Ok(()) => {
-                tracing::info!("job's stage is done");
-                Ok(())
-            }
-            Err(JobError::Lost | JobError::Cancelled(_)) => {
-                tracing::info!("job is let go");
-                self.store.release(&lease).await
-            }
-            Err(JobError::Failed { fault, retry }) => {
-                tracing::warn!(code = fault.code, detail = fault.detail, retry, "job fails");
-                self.store.fail(&lease, &fault, retry).await
-            }
-        };
-        match ended {
-            Ok(()) | Err(StorageError::Fenced { .. }) => {}
-            Err(error) => {
-                tracing::error!(%error, "the end of a job could not be written; its lease will run out");
-            }
-        }
-    }
-
-    /// Renews the claim and shows progress until the claim is lost or the pool stops.
-    async fn keep(&self, task: &Task) {
-        let mut changes = self.store.changes();
-        let mut shown = task.progress.shown();
-        let mut renewed = tokio::time::Instant::now();
-        let mut tick = tokio::time::interval(self.options.progress_every);
-        loop {
-            let ours = tokio::select! {
-                _ = tick.tick() => false,
-                // A listener that lagged behind has missed something that may concern this job.
-                change = changes.recv() => change.map_or(true, |id| task.claim.lease.all().any(|own| own == id)),
-                () = self.stop.cancelled() => return,
-            };
-            let now = task.progress.shown();
-            if !ours && now == shown && renewed.elapsed() < self.options.lease / 3 {
-                continue;
-            }
-            match self.store.renew(&task.claim.lease, self.options.lease, now.stage, now.percent).await {
-                Ok(()) => (shown, renewed) = (now, tokio::time::Instant::now()),
-                Err(StorageError::Fenced { .. }) => return,
-                Err(error) => tracing::warn!(%error, "a lease could not be renewed"),
-            }
-        }
-    }
 }
 
-async fn run(lane: Lane, task: &Task) -> Result<(), JobError> {
-    match (lane, task.claim.job.kind) {
-        (Lane::Ingest, _) => ingest(task).await,
-        (Lane::Map, JobKind::Registration) => register(task).await,
-        (Lane::Map, JobKind::Removal) => remove(task).await,
-        (Lane::Map, JobKind::Decision) => decide(task).await,
-        (Lane::Map, _) => refine(task).await,
-    }
+/// Whether suspect jobs get a process of their own.
+fn isolates(options: &WorkerOptions) -> bool {
+    options.isolated.as_ref().is_some_and(|isolated| isolated.which != Isolation::Never)
 }

@@ -1,19 +1,23 @@
 //! Files named by the BLAKE3 hash of their bytes: `blobs/ab/cd/abcd…`.
 //!
 //! A blob is written to a temporary file beside its final place, synced, renamed, and the folders are synced: once
-//! [`BlobWriter::finish`] returns, the bytes survive a power cut. Readers check the hash. A blob whose row is not yet
-//! committed is pinned (see `pins`); which blobs are garbage is the rows' business (see `garbage`).
+//! [`BlobWriter::finish`](super::BlobWriter::finish) returns, the bytes survive a power cut. Readers check the hash (see `blob_reader`). A blob whose row
+//! is not yet committed is pinned (see `pins`); which blobs are garbage is the rows' business (see `garbage`).
 
+use std::collections::HashSet;
 use std::fmt;
 use std::fs::{self, File};
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::io::AsyncReadExt;
 use ulid::Ulid;
 
 use super::StorageError;
+use super::blob_writer::Partial;
+use super::ledger::{Ledger, Stamp};
 use super::pins::{FreshBlob, Pin, Pins};
 
 /// The name of a blob: the hash of its bytes.
@@ -49,6 +53,9 @@ pub struct StoredBlob {
 pub struct BlobStore {
     root: Arc<Path>,
     pins: Arc<Pins>,
+    pub(super) ledger: Arc<Ledger>,
+    /// Folders whose names are known to be synced.
+    folders: Arc<Mutex<HashSet<[u8; 2]>>>,
 }
 
 impl BlobStore {
@@ -62,7 +69,23 @@ impl BlobStore {
             _ => {}
         }
         fs::create_dir_all(&partial).map_err(StorageError::io("making the folder of blobs"))?;
-        Ok(Self { root: root.into(), pins: Arc::default() })
+        Ok(Self::beside(root))
+    }
+
+    /// The folder `root` of a backup: nothing is made or thrown away.
+    #[must_use]
+    pub fn read_only(root: &Path) -> Self {
+        Self::beside(root)
+    }
+
+    /// Opens the folder `root`, which another process may be writing to: nothing is thrown away.
+    pub(super) fn beside(root: &Path) -> Self {
+        Self { root: root.into(), pins: Arc::default(), ledger: Arc::default(), folders: Arc::default() }
+    }
+
+    /// The folder.
+    pub(super) fn root(&self) -> &Path {
+        &self.root
     }
 
     /// Where a blob is or would be.
@@ -79,14 +102,6 @@ impl BlobStore {
         self.path(id).is_file()
     }
 
-    /// Begins a blob that arrives in pieces, on the async side.
-    pub async fn writer(&self) -> Result<BlobWriter, StorageError> {
-        let path = self.temporary();
-        let file = tokio::fs::File::create_new(&path).await.map_err(StorageError::io("beginning a blob"))?;
-        let partial = Partial { path, kept: false };
-        Ok(BlobWriter { store: self.clone(), file, partial, hasher: blake3::Hasher::new(), bytes: 0 })
-    }
-
     /// Stores bytes that are in memory. Blocks.
     pub fn put(&self, bytes: &[u8]) -> Result<FreshBlob, StorageError> {
         self.put_with(|file| io::Write::write_all(file, bytes).map_err(StorageError::io("writing a blob")))
@@ -99,13 +114,13 @@ impl BlobStore {
     ) -> Result<FreshBlob, E> {
         let path = self.temporary();
         let mut file = File::create_new(&path).map_err(StorageError::io("beginning a blob"))?;
-        let partial = Partial { path, kept: false };
+        let partial = Partial::new(path);
         write(&mut file)?;
         file.sync_all().map_err(StorageError::io("syncing a blob"))?;
         drop(file);
         // What was written is hashed from the file: a writer may seek back to fill in a header.
         let mut hasher = blake3::Hasher::new();
-        let written = File::open(&partial.path).map_err(StorageError::io("reading a blob back"))?;
+        let written = File::open(partial.path()).map_err(StorageError::io("reading a blob back"))?;
         let bytes = io::copy(&mut io::BufReader::with_capacity(1 << 16, written), &mut hasher)
             .map_err(StorageError::io("reading a blob back"))?;
         let id = BlobId(hasher.finalize());
@@ -115,30 +130,13 @@ impl BlobStore {
 
     /// Makes a synced file of this file system a blob; the file moves. `stored` is what it holds. Blocks.
     pub(super) fn adopt(&self, file: &Path, stored: StoredBlob) -> Result<FreshBlob, StorageError> {
-        Ok(FreshBlob::new(stored, self.place(file, stored.id)?))
+        let pin = self.place(stored.id, |place| fs::rename(file, place))?;
+        Ok(FreshBlob::new(stored, pin))
     }
 
     /// Keeps a blob that is there from being collected.
     pub(super) fn hold(&self, stored: StoredBlob) -> FreshBlob {
         FreshBlob::new(stored, Pin::new(&self.pins, stored.id))
-    }
-
-    /// Reads a whole blob into memory and checks it. Blocks.
-    pub fn get(&self, id: BlobId) -> Result<Vec<u8>, StorageError> {
-        let mut bytes = Vec::new();
-        let mut reader = self.reader(id)?;
-        reader.read_to_end(&mut bytes).map_err(StorageError::io("reading a blob"))?;
-        reader.verify()?;
-        Ok(bytes)
-    }
-
-    /// Opens a blob for reading from its beginning; [`BlobReader::verify`] at the end tells whether it is sound.
-    pub fn reader(&self, id: BlobId) -> Result<BlobReader, StorageError> {
-        match File::open(self.path(id)) {
-            Ok(file) => Ok(BlobReader { id, file, hasher: blake3::Hasher::new() }),
-            Err(e) if e.kind() == io::ErrorKind::NotFound => Err(StorageError::MissingBlob(id.to_string())),
-            Err(e) => Err(StorageError::io("opening a blob")(e)),
-        }
     }
 
     /// The first bytes of a blob, at most `limit`. They are not checked.
@@ -149,23 +147,27 @@ impl BlobStore {
         Ok(head)
     }
 
-    fn temporary(&self) -> PathBuf {
+    pub(super) fn temporary(&self) -> PathBuf {
         self.root.join("partial").join(Ulid::generate().to_string())
     }
 
-    /// Deletes the files of those blobs that nobody has pinned; returns which. Blocks.
-    pub(super) fn remove_unpinned(&self, ids: &[BlobId]) -> Result<Vec<BlobId>, StorageError> {
+    /// Deletes the files of those blobs that nobody has pinned and that are not younger than `age`; returns which. Blocks.
+    pub(super) fn remove_unpinned(&self, ids: &[BlobId], age: Duration) -> Result<Vec<BlobId>, StorageError> {
         let mut removed = Vec::with_capacity(ids.len());
         for id in ids {
             let pins = self.pins.lock();
-            if pins.holds(*id) {
+            let path = self.path(*id);
+            if pins.holds(*id) || is_younger(&path, age) {
                 continue;
             }
-            match fs::remove_file(self.path(*id)) {
+            match fs::remove_file(path) {
                 Err(e) if e.kind() != io::ErrorKind::NotFound => {
                     return Err(StorageError::io("deleting a blob")(e));
                 }
-                _ => removed.push(*id),
+                _ => {
+                    self.ledger.forget(*id);
+                    removed.push(*id);
+                }
             }
         }
         Ok(removed)
@@ -176,112 +178,52 @@ impl BlobStore {
         self.pins.take_released()
     }
 
-    fn settle(&self, mut partial: Partial, id: BlobId) -> Result<Pin, StorageError> {
-        let pin = self.place(&partial.path, id)?;
-        partial.kept = true;
-        Ok(pin)
-    }
-
-    /// Pins the blob, moves a synced file to its place and syncs the folders on the way. An equal blob that is there
-    /// already is replaced, which repairs it if it was damaged.
-    fn place(&self, from: &Path, id: BlobId) -> Result<Pin, StorageError> {
-        let pin = Pin::new(&self.pins, id);
+    /// The folder of a blob. It is made if needed, and its name and that of the folder above it are synced.
+    fn folder(&self, id: BlobId) -> Result<PathBuf, StorageError> {
         let place = self.path(id);
         let folders: Vec<&Path> = place.ancestors().skip(1).take(3).collect();
-        if let Some(inner) = folders.first() {
+        let &[inner, middle, root] = folders.as_slice() else { return Ok(place) };
+        let [first, second, ..] = *id.0.as_bytes();
+        let known = |known: &HashSet<[u8; 2]>| known.contains(&[first, second]);
+        if !known(&self.folders.lock().unwrap_or_else(PoisonError::into_inner)) {
             fs::create_dir_all(inner).map_err(StorageError::io("making a folder of blobs"))?;
+            sync_folder(middle)?;
+            sync_folder(root)?;
+            // Only now may others rely on it.
+            self.folders.lock().unwrap_or_else(PoisonError::into_inner).insert([first, second]);
         }
-        fs::rename(from, &place).map_err(StorageError::io("naming a blob"))?;
-        for folder in folders {
-            File::open(folder)
-                .and_then(|folder| folder.sync_all())
-                .map_err(StorageError::io("syncing a folder of blobs"))?;
-        }
+        Ok(inner.to_owned())
+    }
+
+    /// Gives a synced temporary file its place.
+    pub(super) fn settle(&self, partial: Partial, id: BlobId) -> Result<Pin, StorageError> {
+        self.place(id, |place| partial.keep_as(place))
+    }
+
+    /// Pins the blob, has a synced file moved to its place, and syncs its folder. An equal blob that is there already is replaced, which
+    /// repairs it if it was damaged.
+    fn place(&self, id: BlobId, moved: impl FnOnce(&Path) -> io::Result<()>) -> Result<Pin, StorageError> {
+        let pin = Pin::new(&self.pins, id);
+        let place = self.path(id);
+        let inner = self.folder(id)?;
+        moved(&place).map_err(StorageError::io("naming a blob"))?;
+        sync_folder(&inner)?;
+        let metadata = fs::metadata(&place).map_err(StorageError::io("naming a blob"))?;
+        self.ledger.sound(id, Stamp::of(&metadata));
         Ok(pin)
     }
 }
 
-/// A temporary file that disappears unless it is kept.
-#[derive(Debug)]
-struct Partial {
-    path: PathBuf,
-    kept: bool,
+/// Whether a file was written within the last `age`; one that seems to come from the future was not.
+fn is_younger(path: &Path, age: Duration) -> bool {
+    let written = fs::metadata(path).and_then(|m| m.modified());
+    age > Duration::ZERO && written.is_ok_and(|at| at.elapsed().is_ok_and(|old| old < age))
 }
 
-impl Drop for Partial {
-    fn drop(&mut self) {
-        if !self.kept {
-            // Nobody can be told, and the next start clears the folder.
-            let _ = fs::remove_file(&self.path);
-        }
-    }
-}
-
-/// A blob that is arriving. Dropping it forgets what has arrived.
-#[derive(Debug)]
-pub struct BlobWriter {
-    store: BlobStore,
-    file: tokio::fs::File,
-    partial: Partial,
-    hasher: blake3::Hasher,
-    bytes: u64,
-}
-
-impl BlobWriter {
-    /// Appends a piece.
-    pub async fn write(&mut self, piece: &[u8]) -> Result<(), StorageError> {
-        self.hasher.update(piece);
-        self.bytes += piece.len() as u64;
-        self.file.write_all(piece).await.map_err(StorageError::io("writing a blob"))
-    }
-
-    /// Bytes so far.
-    #[must_use]
-    pub fn bytes(&self) -> u64 {
-        self.bytes
-    }
-
-    /// Makes the blob safe: file and folders are synced when this returns.
-    pub async fn finish(mut self) -> Result<FreshBlob, StorageError> {
-        self.file.flush().await.map_err(StorageError::io("writing a blob"))?;
-        self.file.sync_all().await.map_err(StorageError::io("syncing a blob"))?;
-        let stored = StoredBlob { id: BlobId(self.hasher.finalize()), bytes: self.bytes };
-        let Self { store, partial, .. } = self;
-        let pin = tokio::task::spawn_blocking(move || store.settle(partial, stored.id))
-            .await
-            .map_err(|e| StorageError::io("naming a blob")(io::Error::other(e)))??;
-        Ok(FreshBlob::new(stored, pin))
-    }
-}
-
-/// Reads a blob and hashes what it reads.
-#[derive(Debug)]
-pub struct BlobReader {
-    id: BlobId,
-    file: File,
-    hasher: blake3::Hasher,
-}
-
-impl Read for BlobReader {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let n = self.file.read(buffer)?;
-        self.hasher.update(buffer.get(..n).unwrap_or_default());
-        Ok(n)
-    }
-}
-
-impl BlobReader {
-    /// Reads what is left and compares the hash with the name.
-    pub fn verify(mut self) -> Result<(), StorageError> {
-        io::copy(&mut self.file, &mut self.hasher).map_err(StorageError::io("reading a blob"))?;
-        let found = self.hasher.finalize();
-        if found == self.id.0 {
-            Ok(())
-        } else {
-            let found = found.to_hex().to_string();
-            Err(StorageError::DamagedBlob { expected: self.id.to_string(), found })
-        }
-    }
+fn sync_folder(folder: &Path) -> Result<(), StorageError> {
+    File::open(folder)
+        .and_then(|folder| folder.sync_all())
+        .map_err(StorageError::io("syncing a folder of blobs"))
 }
 
 #[cfg(test)]
@@ -292,7 +234,7 @@ mod tests {
     async fn bytes_that_arrive_in_pieces_are_found_under_their_hash() {
         let dir = tempfile::tempdir().unwrap();
         let store = BlobStore::open(dir.path()).unwrap();
-        let mut writer = store.writer().await.unwrap();
+        let mut writer = store.writer();
         writer.write(b"one ").await.unwrap();
         writer.write(b"two").await.unwrap();
         let stored = writer.finish().await.unwrap();
@@ -305,7 +247,7 @@ mod tests {
     async fn an_abandoned_write_leaves_no_file() {
         let dir = tempfile::tempdir().unwrap();
         let store = BlobStore::open(dir.path()).unwrap();
-        let mut writer = store.writer().await.unwrap();
+        let mut writer = store.writer();
         writer.write(&vec![1; 100_000]).await.unwrap();
         drop(writer);
         assert_eq!(fs::read_dir(dir.path().join("partial")).unwrap().count(), 0);
@@ -329,12 +271,19 @@ mod tests {
         let (first, second) = (store.put(b"needed").unwrap(), store.put(b"needed").unwrap());
         let id = first.id;
         drop(first);
-        assert_eq!((store.remove_unpinned(&[id]).unwrap(), store.take_released()), (vec![], vec![]));
+        assert_eq!(
+            (store.remove_unpinned(&[id], Duration::ZERO).unwrap(), store.take_released()),
+            (vec![], vec![])
+        );
         drop(second);
         assert_eq!(store.take_released(), [id]);
-        assert_eq!(store.remove_unpinned(&[id]).unwrap(), [id]);
+        assert_eq!(store.remove_unpinned(&[id], Duration::ZERO).unwrap(), [id]);
         assert!(!store.contains(id));
-        assert_eq!(store.remove_unpinned(&[id]).unwrap(), [id], "a file that is gone already is no error");
+        assert_eq!(
+            store.remove_unpinned(&[id], Duration::ZERO).unwrap(),
+            [id],
+            "a file that is gone already is no error"
+        );
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The workers' side of the job table: claim, renew, give back, move on, fail.
+//! The workers' side of the job table: claim, renew, give back, move on. What happens when it does not go well is in `setbacks`.
 //!
 //! A claim is a lease in the row: worker, attempt and a moment after which the worker is taken for dead. The attempt
 //! grows with every claim and fences: whoever holds an older one changes nothing any more.
@@ -8,9 +8,9 @@ use std::time::Duration;
 use sqlx::{Row, Sqlite, Transaction};
 
 use super::job_rows::job;
-use super::rows::{parsed, to_json};
+use super::rows::{count, word};
 use super::{StorageError, Store};
-use crate::project::{Fault, Job, JobId, JobKind, Lane, Timestamp};
+use crate::project::{Job, JobId, JobKind, Lane, Timestamp};
 
 /// Which claim a worker holds.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -32,6 +32,8 @@ pub struct Claim {
     pub job: Job,
     /// Further registrations of the same project that are mapped together with it.
     pub members: Vec<Job>,
+    /// Whether a process died or did not end while it was at this job. It may be the cause.
+    pub suspect: bool,
 }
 
 /// What decoding finds out about a scan.
@@ -47,20 +49,12 @@ pub struct Measures {
     pub scale: f64,
 }
 
-/// How often a job may fail for reasons that may pass.
-const MAX_TRIES: i64 = 3;
-/// How often a job's worker may die while it is alone with it: then the job is taken for the cause.
-const MAX_LOSSES: i64 = 8;
-
-/// The oldest job that may be mapped now. Mapping is serial in a project. A registration waits for removals before
-/// it, and, from the ninth scan on, until the first eight are decoded, because these decide the resolution. What
-/// works on the whole model waits for everything that was accepted before it.
-const READY_TO_MAP: &str = "
-    SELECT j.seq FROM jobs j LEFT JOIN scans s ON s.id = j.scan_id
-    WHERE j.lane = 'map' AND j.state IN ('accepted', 'running') AND j.worker IS NULL AND j.leader IS NULL
+/// Jobs `j` (with their scans `s`) of a project that nobody maps now which may be mapped. A registration waits for removals before
+/// it, and, from the ninth scan on, until the first eight are decoded, because these decide the resolution. What works on the
+/// whole model waits for everything that was accepted before it.
+const MAY_BE_MAPPED: &str = "
+    j.lane = 'map' AND j.state IN ('accepted', 'running') AND j.worker IS NULL AND j.leader IS NULL
       AND j.not_before_ms <= ?1
-      AND NOT EXISTS (SELECT 1 FROM jobs h
-                      WHERE h.project_id = j.project_id AND h.lane = 'map' AND h.worker IS NOT NULL)
       AND CASE j.kind
         WHEN 'removal' THEN 1
         WHEN 'registration' THEN
@@ -77,34 +71,56 @@ const READY_TO_MAP: &str = "
                                AND e.state NOT IN ('failed', 'dismissed')))
         ELSE NOT EXISTS (SELECT 1 FROM jobs e WHERE e.project_id = j.project_id
                          AND e.state IN ('accepted', 'running') AND e.seq < j.seq)
-      END
-    ORDER BY j.seq";
+      END";
 
-const READY_TO_INGEST: &str = "
-    SELECT j.seq FROM jobs j
-    WHERE j.lane = 'ingest' AND j.state IN ('accepted', 'running') AND j.worker IS NULL AND j.not_before_ms <= ?1
-    ORDER BY j.seq";
+/// The job to be mapped next: mapping is serial in a project, and projects take turns, so that a thousand scans of one do not keep
+/// another's single scan waiting. In a project the oldest comes first.
+fn next_to_map() -> String {
+    format!(
+        "SELECT seq FROM (
+           SELECT p.map_turn AS turn, (SELECT j.seq FROM jobs j LEFT JOIN scans s ON s.id = j.scan_id
+                                       WHERE j.project_id = p.id AND {MAY_BE_MAPPED} ORDER BY j.seq LIMIT 1) AS seq
+           FROM projects p
+           WHERE p.id IN (SELECT o.project_id FROM jobs o WHERE o.lane = 'map' AND o.state IN ('accepted', 'running'))
+             AND NOT EXISTS (SELECT 1 FROM jobs h WHERE h.project_id = p.id AND h.lane = 'map' AND h.worker IS NOT NULL))
+         WHERE seq IS NOT NULL ORDER BY turn, seq LIMIT 1"
+    )
+}
+
+/// The job to be ingested next: of the project that the fewest workers are at, and of those the one whose turn was longest ago.
+const NEXT_TO_INGEST: &str = "
+    SELECT seq FROM (
+      SELECT p.ingest_turn AS turn,
+        (SELECT j.seq FROM jobs j WHERE j.project_id = p.id AND j.lane = 'ingest' AND j.state IN ('accepted', 'running')
+           AND j.worker IS NULL AND j.not_before_ms <= ?1 ORDER BY j.seq LIMIT 1) AS seq,
+        (SELECT COUNT(*) FROM jobs w WHERE w.project_id = p.id AND w.lane = 'ingest' AND w.state IN ('accepted', 'running')
+           AND w.worker IS NOT NULL) AS workers
+      FROM projects p
+      WHERE p.id IN (SELECT o.project_id FROM jobs o WHERE o.lane = 'ingest' AND o.state IN ('accepted', 'running')))
+    WHERE seq IS NOT NULL ORDER BY workers, turn, seq LIMIT 1";
 
 impl Store {
-    /// Takes up the oldest job of a lane that is ready, if any. A registration in the map lane brings up to `batch - 1`
-    /// others of its project with it, unless one of them has failed or lost a worker before: then each goes alone.
+    /// Takes up the job of a lane whose turn it is, if any is ready. A registration in the map lane brings up to `batch - 1` others of
+    /// its project with it, unless one of them failed before: then each goes alone. Those whose worker died before also go alone,
+    /// unless suspects work in a process of their own (`isolated`), where they can do no harm; then suspects go together.
     pub async fn claim(
         &self,
         lane: Lane,
         worker: &str,
         lease: Duration,
         batch: u32,
+        isolated: bool,
     ) -> Result<Option<Claim>, StorageError> {
         let now = Timestamp::now();
-        let ready = match lane {
-            Lane::Ingest => READY_TO_INGEST,
-            Lane::Map => READY_TO_MAP,
+        let (next, turn) = match lane {
+            Lane::Ingest => (NEXT_TO_INGEST.to_owned(), "ingest_turn"),
+            Lane::Map => (next_to_map(), "map_turn"),
         };
         let mut tx = self.begin().await?;
         let row = sqlx::query(sqlx::AssertSqlSafe(format!(
             "UPDATE jobs SET state = 'running', worker = ?2, attempt = attempt + 1, lease_ms = ?3,
                started_ms = COALESCE(started_ms, ?1), updated_ms = ?1, revision = revision + 1
-             WHERE seq = ({ready} LIMIT 1) RETURNING *"
+             WHERE seq = ({next}) RETURNING *"
         )))
         .bind(now.0)
         .bind(worker)
@@ -113,20 +129,43 @@ impl Store {
         .await?;
         let Some(row) = row else { return Ok(None) };
         let leader = job(&row)?;
-        let fresh = row.try_get::<i64, _>("tries")? == 0 && row.try_get::<i64, _>("losses")? == 0;
-        let members = if lane == Lane::Map && leader.kind == JobKind::Registration && fresh && batch > 1 {
-            join_batch(&mut tx, &leader, now, batch - 1).await?
+        sqlx::query(sqlx::AssertSqlSafe(format!("UPDATE projects SET {turn} = ? WHERE id = ?")))
+            .bind(now.0)
+            .bind(leader.project.to_string())
+            .execute(&mut *tx)
+            .await?;
+        let faults = row.try_get::<i64, _>("tries")? + row.try_get::<i64, _>("crashes")?;
+        let lost = row.try_get::<i64, _>("losses")? > 0;
+        let together = faults == 0 && (isolated || !lost) && batch > 1;
+        let members = if lane == Lane::Map && leader.kind == JobKind::Registration && together {
+            join_batch(&mut tx, &leader, lost, now, batch - 1).await?
         } else {
             Vec::new()
         };
         tx.commit().await?;
-        let lease = Lease {
-            job: leader.id,
-            attempt: leader.attempt,
-            members: members.iter().map(|m| m.id).collect(),
-        };
-        self.announce(lease.all());
-        Ok(Some(Claim { lease, job: leader, members }))
+        let claim = claimed(leader, members, lost || row.try_get::<i64, _>("crashes")? > 0);
+        self.announce(claim.lease.all());
+        Ok(Some(claim))
+    }
+
+    /// What another process has claimed, for the process that works on it. [`StorageError::Fenced`] if it is no longer so.
+    pub async fn held(&self, id: JobId, attempt: u32) -> Result<(Lane, Claim), StorageError> {
+        let row = sqlx::query(
+            "SELECT * FROM jobs WHERE id = ? AND attempt = ? AND worker IS NOT NULL AND state = 'running'",
+        )
+        .bind(id.to_string())
+        .bind(i64::from(attempt))
+        .fetch_optional(&self.read)
+        .await?
+        .ok_or(StorageError::Fenced { job: id, attempt })?;
+        let members = sqlx::query("SELECT * FROM jobs WHERE leader = ? AND state = 'running' ORDER BY seq")
+            .bind(id.to_string())
+            .fetch_all(&self.read)
+            .await?;
+        let members = members.iter().map(job).collect::<Result<_, _>>()?;
+        let lane =
+            word(&row, "lane", |word| [Lane::Ingest, Lane::Map].into_iter().find(|l| l.as_str() == word))?;
+        Ok((lane, claimed(job(&row)?, members, true)))
     }
 
     /// Keeps a claim alive and shows progress. [`StorageError::Fenced`] when the claim is no longer held whole.
@@ -167,6 +206,27 @@ impl Store {
         Ok(())
     }
 
+    /// The revision of a job that is still held by this claim, with its whole batch; `None` if it is not.
+    pub async fn holds(&self, lease: &Lease) -> Result<Option<u64>, StorageError> {
+        let row = sqlx::query(
+            "SELECT revision, (SELECT COUNT(*) FROM jobs WHERE leader = ?1 AND state = 'running') AS members FROM jobs
+               WHERE id = ?1 AND attempt = ?2 AND worker IS NOT NULL AND state = 'running'",
+        )
+        .bind(lease.job.to_string())
+        .bind(i64::from(lease.attempt))
+        .fetch_optional(&self.read)
+        .await?;
+        let Some(row) = row else { return Ok(None) };
+        let whole = row.try_get::<i64, _>("members")? == lease.members.len() as i64;
+        if whole { Ok(Some(count(&row, "revision")?)) } else { Ok(None) }
+    }
+
+    /// Tells listeners of jobs that another process has changed, and wakes idle workers.
+    pub fn relay(&self, jobs: impl IntoIterator<Item = JobId>) {
+        self.announce(jobs);
+        self.ring();
+    }
+
     /// Gives a claim back untouched, as at a shutdown. A claim that is no longer held needs no giving back, but
     /// members of its batch may still point at it.
     pub async fn release(&self, lease: &Lease) -> Result<(), StorageError> {
@@ -203,7 +263,7 @@ impl Store {
         let mut tx = self.begin().await?;
         check(&mut tx, lease).await?;
         sqlx::query(
-            "UPDATE jobs SET lane = 'map', worker = NULL, lease_ms = NULL, tries = 0, losses = 0, stage = 'queued',
+            "UPDATE jobs SET lane = 'map', worker = NULL, lease_ms = NULL, tries = 0, losses = 0, crashes = 0, stage = 'queued',
                updated_ms = ?, revision = revision + 1 WHERE id = ?",
         )
         .bind(now.0)
@@ -219,89 +279,6 @@ impl Store {
         self.ring();
         Ok(())
     }
-
-    /// Ends a job with a fault. If it may pass (`retry`) the job goes back to its queue a few times first, and
-    /// members of its batch go back at once, each to be tried alone.
-    pub async fn fail(&self, lease: &Lease, fault: &Fault, retry: bool) -> Result<(), StorageError> {
-        let now = Timestamp::now();
-        let mut tx = self.begin().await?;
-        check(&mut tx, lease).await?;
-        free(&mut tx, lease).await?;
-        for id in lease.all() {
-            let row = sqlx::query("UPDATE jobs SET tries = tries + 1 WHERE id = ? RETURNING tries")
-                .bind(id.to_string())
-                .fetch_one(&mut *tx)
-                .await?;
-            let tries: i64 = row.try_get("tries")?;
-            let alone = lease.members.is_empty();
-            if alone && (!retry || tries >= MAX_TRIES) {
-                end_failed(&mut tx, id, fault, now).await?;
-            } else if alone {
-                sqlx::query("UPDATE jobs SET not_before_ms = ? WHERE id = ?")
-                    .bind(now.plus(Duration::from_millis(500 << tries.clamp(0, 6))).0)
-                    .bind(id.to_string())
-                    .execute(&mut *tx)
-                    .await?;
-            }
-        }
-        tx.commit().await?;
-        self.announce(lease.all());
-        self.ring();
-        Ok(())
-    }
-
-    /// Takes claims back whose worker is dead: all of them at the start of the process (nobody can hold one then), and
-    /// later those whose lease ran out. Returns how many.
-    pub async fn reclaim(&self, all: bool) -> Result<usize, StorageError> {
-        let now = Timestamp::now();
-        let mut tx = self.begin().await?;
-        let rows = sqlx::query(
-            "SELECT id, attempt, losses, (SELECT COUNT(*) FROM jobs m WHERE m.leader = jobs.id) AS members FROM jobs
-               WHERE worker IS NOT NULL AND (?1 OR lease_ms < ?2)",
-        )
-        .bind(all)
-        .bind(now.0)
-        .fetch_all(&mut *tx)
-        .await?;
-        let mut changed = Vec::new();
-        for row in &rows {
-            let id: JobId = parsed(row, "id")?;
-            let losses = row.try_get::<i64, _>("losses")? + 1;
-            let alone = row.try_get::<i64, _>("members")? == 0;
-            let wait =
-                if losses > 2 { Duration::from_millis(250 << losses.clamp(0, 7)) } else { Duration::ZERO };
-            sqlx::query(
-                "UPDATE jobs SET worker = NULL, lease_ms = NULL, losses = losses + 1, not_before_ms = ?2 WHERE id = ?1",
-            )
-            .bind(id.to_string())
-            .bind(now.plus(wait).0)
-            .execute(&mut *tx)
-            .await?;
-            sqlx::query("UPDATE jobs SET leader = NULL, losses = losses + 1 WHERE leader = ?")
-                .bind(id.to_string())
-                .execute(&mut *tx)
-                .await?;
-            if alone && losses >= MAX_LOSSES {
-                let detail = format!("its worker died {losses} times while it was at this job");
-                end_failed(&mut tx, id, &Fault { code: "worker-lost".to_owned(), detail }, now).await?;
-            }
-            changed.push(id);
-        }
-        // Members must never wait for a leader that nobody holds.
-        sqlx::query(
-            "UPDATE jobs SET leader = NULL WHERE leader IS NOT NULL AND NOT EXISTS
-               (SELECT 1 FROM jobs l WHERE l.id = jobs.leader AND l.worker IS NOT NULL)",
-        )
-        .execute(&mut *tx)
-        .await?;
-        tx.commit().await?;
-        let n = changed.len();
-        self.announce(changed);
-        if n > 0 {
-            self.ring();
-        }
-        Ok(n)
-    }
 }
 
 impl Lease {
@@ -311,25 +288,32 @@ impl Lease {
     }
 }
 
-/// Puts further registrations that are ready under the leader.
+fn claimed(leader: Job, members: Vec<Job>, suspect: bool) -> Claim {
+    let lease =
+        Lease { job: leader.id, attempt: leader.attempt, members: members.iter().map(|m| m.id).collect() };
+    Claim { lease, job: leader, members, suspect }
+}
+
+/// Puts further registrations that are ready under the leader: those that are as suspect as it is (`lost`).
 async fn join_batch(
     tx: &mut Transaction<'static, Sqlite>,
     leader: &Job,
+    lost: bool,
     now: Timestamp,
     limit: u32,
 ) -> Result<Vec<Job>, StorageError> {
-    // The leader holds the project now, so the question is asked as if it did not.
-    let ready = READY_TO_MAP.replace("h.worker IS NOT NULL)", "h.worker IS NOT NULL AND h.id <> ?2)");
     let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
         "UPDATE jobs SET state = 'running', leader = ?2, attempt = attempt + 1,
            started_ms = COALESCE(started_ms, ?1), updated_ms = ?1, revision = revision + 1
-         WHERE seq IN (SELECT seq FROM jobs WHERE seq IN ({ready}) AND project_id = ?3 AND kind = 'registration'
-                       AND tries = 0 AND losses = 0 ORDER BY seq LIMIT ?4) RETURNING *"
+         WHERE seq IN (SELECT j.seq FROM jobs j JOIN scans s ON s.id = j.scan_id
+                       WHERE j.project_id = ?3 AND j.kind = 'registration' AND {MAY_BE_MAPPED}
+                         AND j.tries = 0 AND j.crashes = 0 AND (j.losses > 0) = ?5 ORDER BY j.seq LIMIT ?4) RETURNING *"
     )))
     .bind(now.0)
     .bind(leader.id.to_string())
     .bind(leader.project.to_string())
     .bind(limit)
+    .bind(lost)
     .fetch_all(&mut **tx)
     .await?;
     rows.iter().map(job).collect()
@@ -354,7 +338,7 @@ pub(super) async fn check(tx: &mut Transaction<'static, Sqlite>, lease: &Lease) 
 }
 
 /// Lets go of a job and its members, if this attempt still holds it.
-async fn free(tx: &mut Transaction<'static, Sqlite>, lease: &Lease) -> Result<bool, StorageError> {
+pub(super) async fn free(tx: &mut Transaction<'static, Sqlite>, lease: &Lease) -> Result<bool, StorageError> {
     let done = sqlx::query(
         "UPDATE jobs SET worker = NULL, lease_ms = NULL WHERE id = ? AND attempt = ? AND worker IS NOT NULL",
     )
@@ -370,30 +354,4 @@ async fn free(tx: &mut Transaction<'static, Sqlite>, lease: &Lease) -> Result<bo
             .await?;
     }
     Ok(held)
-}
-
-/// Puts a job, and the scan that it would have registered, into their failed states.
-async fn end_failed(
-    tx: &mut Transaction<'static, Sqlite>,
-    id: JobId,
-    fault: &Fault,
-    now: Timestamp,
-) -> Result<(), StorageError> {
-    sqlx::query(
-        "UPDATE jobs SET state = 'failed', fault = ?1, worker = NULL, leader = NULL, finished_ms = ?2, updated_ms = ?2,
-           revision = revision + 1 WHERE id = ?3 AND state IN ('accepted', 'running')",
-    )
-    .bind(to_json(fault)?)
-    .bind(now.0)
-    .bind(id.to_string())
-    .execute(&mut **tx)
-    .await?;
-    sqlx::query(
-        "UPDATE scans SET state = 'failed', standing = ?1 WHERE job_id = ?2 AND state IN ('received', 'ingested')",
-    )
-    .bind(to_json(&crate::project::Standing::Failed(fault.clone()))?)
-    .bind(id.to_string())
-    .execute(&mut **tx)
-    .await?;
-    Ok(())
 }

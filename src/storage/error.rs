@@ -1,5 +1,8 @@
 //! What can go wrong below the service.
 
+use std::io::ErrorKind;
+use std::path::PathBuf;
+
 use crate::project::{DecisionId, JobId, KeyId, ProjectId, ScanId, UploadId, VersionNumber};
 
 /// A failure of the database or of the blob files.
@@ -77,6 +80,17 @@ pub enum StorageError {
         /// The value.
         value: String,
     },
+    /// The database was written by an older or a newer program.
+    #[error(
+        "the data directory was written by another version of this program; start the service of this version on it once"
+    )]
+    OtherSchema,
+    /// There is no database where one must be.
+    #[error("{} is no data directory: it holds no cairn.sqlite", .0.display())]
+    NoData(PathBuf),
+    /// Something is where a copy was to be made.
+    #[error("{} is not empty", .0.display())]
+    NotEmpty(PathBuf),
     /// Another process serves this data directory.
     #[error("the data directory is in use by another process")]
     InUse,
@@ -96,7 +110,53 @@ pub enum StorageError {
     Migration(#[from] sqlx::migrate::MigrateError),
 }
 
+/// Trouble that is the machine's and not the request's: it may pass.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Trouble {
+    /// No space is left for what was to be written.
+    Full,
+    /// The database is locked by another process for too long.
+    Busy,
+    /// A file could not be read, written or synced.
+    Failing,
+}
+
+/// Result codes of SQLite: <https://www.sqlite.org/rescode.html>. Extended codes have these in their lowest byte.
+const SQLITE_BUSY: i32 = 5;
+const SQLITE_LOCKED: i32 = 6;
+const SQLITE_IOERR: i32 = 10;
+const SQLITE_FULL: i32 = 13;
+const SQLITE_CANTOPEN: i32 = 14;
+
 impl StorageError {
+    /// Whether something was stored and cannot be read any more.
+    #[must_use]
+    pub fn is_damage(&self) -> bool {
+        matches!(self, Self::MissingBlob(_) | Self::DamagedBlob { .. } | Self::BadRow { .. })
+    }
+
+    /// What the machine lacks, if that is why.
+    #[must_use]
+    pub fn trouble(&self) -> Option<Trouble> {
+        match self {
+            Self::Io { source, .. } => Some(match source.kind() {
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => Trouble::Full,
+                _ => Trouble::Failing,
+            }),
+            Self::Database(sqlx::Error::PoolTimedOut) => Some(Trouble::Busy),
+            Self::Database(sqlx::Error::Database(error)) => {
+                let code: i32 = error.code()?.parse().ok()?;
+                match code & 0xff {
+                    SQLITE_FULL => Some(Trouble::Full),
+                    SQLITE_BUSY | SQLITE_LOCKED => Some(Trouble::Busy),
+                    SQLITE_IOERR | SQLITE_CANTOPEN => Some(Trouble::Failing),
+                    _ => None,
+                }
+            }
+            _ => None,
+        }
+    }
+
     /// Wraps an I/O error with what was being done.
     pub(super) fn io(action: &'static str) -> impl FnOnce(std::io::Error) -> Self {
         move |source| Self::Io { action, source }

@@ -2,39 +2,54 @@
 //!
 //! Triggers note every blob that loses a reference, in the transaction that takes it. The collector looks whether
 //! another row needs it while it holds the one write lock, so no row can appear meanwhile; a blob whose row is still to
-//! be committed is pinned. What a crash leaves noted is looked at again.
+//! be committed is pinned. What a crash leaves noted is looked at again;
+//! files that it leaves unnoted are found by `orphans`.
+
+use std::time::Duration;
 
 use sqlx::Row;
 
-use super::{BlobId, StorageError, Store};
+use super::{BlobId, StorageError, Store, hold};
 use crate::project::Timestamp;
 
 /// Blobs looked at in one transaction.
 const AT_ONCE: i64 = 64;
 
-/// A noted blob, and whether a row needs it. A deleted scan's upload is needed until the model holds the scan no more,
-/// the engine's state until there is a newer one.
-const NOTED: &str = "
-    SELECT g.rowid AS position, g.blob,
-           EXISTS (SELECT 1 FROM scans s WHERE s.blob = g.blob AND s.forgotten_ms IS NULL)
-           OR EXISTS (SELECT 1 FROM versions v JOIN projects p ON p.id = v.project_id
-                      WHERE v.snapshot = g.blob AND v.number = p.head)
-           OR EXISTS (SELECT 1 FROM versions v WHERE v.content = g.blob)
-           OR EXISTS (SELECT 1 FROM uploads u WHERE u.blob = g.blob AND u.scan_id IS NULL)
-           OR EXISTS (SELECT 1 FROM derived d WHERE d.blob = g.blob) AS needed
-    FROM garbage g WHERE g.rowid > ? ORDER BY g.rowid LIMIT ?";
+/// The SQL condition that a row needs the blob that `name` names. A deleted scan's upload is needed until the model holds the scan
+/// no more, the engine's state until there is a newer one. Every table that names blobs is in here.
+pub(super) fn needed(name: &str) -> String {
+    format!(
+        "EXISTS (SELECT 1 FROM scans s WHERE s.blob = {name} AND s.forgotten_ms IS NULL)
+         OR EXISTS (SELECT 1 FROM versions v JOIN projects p ON p.id = v.project_id
+                    WHERE v.snapshot = {name} AND v.number = p.head)
+         OR EXISTS (SELECT 1 FROM versions v WHERE v.content = {name})
+         OR EXISTS (SELECT 1 FROM uploads u WHERE u.blob = {name} AND u.scan_id IS NULL)
+         OR EXISTS (SELECT 1 FROM derived d WHERE d.blob = {name})"
+    )
+}
 
 impl Store {
-    /// Deletes the files of blobs that no row needs any more. Returns how many.
-    pub async fn collect_garbage(&self) -> Result<usize, StorageError> {
+    /// Deletes the files of blobs that no row needs any more, unless a [`Hold`](super::Hold) keeps them or they are younger than `age`:
+    /// another process that works for this one may be about to commit their rows. Returns how many.
+    pub async fn collect_garbage(&self, age: Duration) -> Result<usize, StorageError> {
         let now = Timestamp::now();
         self.forget_uploads(now).await?;
         self.forget_answers(now).await?;
         self.note_released().await?;
+        let noted = format!(
+            "SELECT g.rowid AS position, g.blob, ({}) AS needed FROM garbage g WHERE g.rowid > ? ORDER BY g.rowid LIMIT ?",
+            needed("g.blob")
+        );
         let (mut collected, mut after) = (0, 0);
         loop {
+            // A backup or another process that needs files to stay: they are looked at again later.
+            let Some(_turn) = hold::turn(&self.data)? else { return Ok(collected) };
             let mut tx = self.begin().await?;
-            let rows = sqlx::query(NOTED).bind(after).bind(AT_ONCE).fetch_all(&mut *tx).await?;
+            let rows = sqlx::query(sqlx::AssertSqlSafe(noted.as_str()))
+                .bind(after)
+                .bind(AT_ONCE)
+                .fetch_all(&mut *tx)
+                .await?;
             let Some(last) = rows.last() else { return Ok(collected) };
             after = last.try_get("position")?;
             let (mut settled, mut unneeded) = (Vec::new(), Vec::new());
@@ -43,7 +58,7 @@ impl Store {
                 if row.try_get("needed")? { settled.push(id) } else { unneeded.push(id) }
             }
             let blobs = self.blobs.clone();
-            let removed = tokio::task::spawn_blocking(move || blobs.remove_unpinned(&unneeded))
+            let removed = tokio::task::spawn_blocking(move || blobs.remove_unpinned(&unneeded, age))
                 .await
                 .map_err(|e| StorageError::io("deleting blobs")(std::io::Error::other(e)))??;
             collected += removed.len();
@@ -77,8 +92,6 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use serde_json::json;
 
     use super::*;
@@ -123,13 +136,13 @@ mod tests {
 
         /// Collects, then says which of the texts are still there.
         async fn left(&self, texts: &[&str]) -> Vec<bool> {
-            self.store.collect_garbage().await.unwrap();
+            self.store.collect_garbage(Duration::ZERO).await.unwrap();
             let there = |text: &&str| self.store.blobs.contains(BlobId(blake3::hash(text.as_bytes())));
             texts.iter().map(there).collect()
         }
 
         async fn claim(&self) -> Claim {
-            self.store.claim(Lane::Map, "worker", Duration::from_mins(1), 1).await.unwrap().unwrap()
+            self.store.claim(Lane::Map, "worker", Duration::from_mins(1), 1, false).await.unwrap().unwrap()
         }
 
         async fn publish(&self, claim: &Claim, from: u32, version: Option<(&str, &str)>) {

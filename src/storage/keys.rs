@@ -1,4 +1,4 @@
-//! API keys. The only table that another process may change while the service runs: `cairn key` opens it without the
+//! API keys. The only table that an operator's command may change while the service runs: `cairn key` opens it without the
 //! lock of the data directory.
 //!
 //! That is sound because a key is one row that nobody holds in memory: the service reads it anew for every request,

@@ -4,7 +4,9 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use super::{Admission, BlobId, Claim, JobFilter, Measures, NewScan, Page, Publication, StorageError, Store};
+use super::{
+    Admission, BlobId, Claim, JobFilter, Measures, NewScan, Page, Publication, Retry, StorageError, Store,
+};
 use crate::project::{
     ContentKey, Fault, Interpretation, JobKind, JobState, Lane, Name, ProjectId, ProjectSettings, ScanState,
     VersionNumber,
@@ -41,7 +43,7 @@ impl Fixture {
     }
 
     async fn claim(&self, lane: Lane) -> Option<Claim> {
-        self.store.claim(lane, "worker", LONG, 10).await.unwrap()
+        self.store.claim(lane, "worker", LONG, 10, false).await.unwrap()
     }
 
     /// A scan whose registration waits for the mapper.
@@ -74,10 +76,10 @@ impl Fixture {
 async fn a_job_is_held_once_and_after_its_lease_by_another_who_fences_the_first() {
     let f = Fixture::new().await;
     f.scan(1).await;
-    let first = f.store.claim(Lane::Ingest, "a", Duration::ZERO, 1).await.unwrap().unwrap();
+    let first = f.store.claim(Lane::Ingest, "a", Duration::ZERO, 1, false).await.unwrap().unwrap();
     assert!(f.claim(Lane::Ingest).await.is_none(), "it is held");
     tokio::time::sleep(Duration::from_millis(5)).await;
-    assert_eq!(f.store.reclaim(false).await.unwrap(), 1);
+    assert_eq!(f.store.reclaim(false, false).await.unwrap(), 1);
     let second = f.claim(Lane::Ingest).await.unwrap();
     assert_eq!(second.lease.attempt, first.lease.attempt + 1);
     for result in
@@ -114,10 +116,10 @@ async fn a_batch_that_fails_is_tried_again_one_by_one() {
     let fault = Fault { code: "internal-error".to_owned(), detail: "for the test".to_owned() };
     let both = f.claim(Lane::Map).await.unwrap();
     assert_eq!(both.members.len(), 1);
-    f.store.fail(&both.lease, &fault, true).await.unwrap();
+    f.store.fail(&both.lease, &fault, Retry::AFewTimes).await.unwrap();
     let alone = f.claim(Lane::Map).await.unwrap();
     assert_eq!((alone.job.id, alone.members.len()), (a.job.id, 0));
-    f.store.fail(&alone.lease, &fault, false).await.unwrap();
+    f.store.fail(&alone.lease, &fault, Retry::Never).await.unwrap();
     assert_eq!(f.store.job(a.job.id).await.unwrap().fault, Some(fault));
     assert_eq!(f.store.scan(f.project, a.scan.id).await.unwrap().state, ScanState::Failed);
     let other = f.claim(Lane::Map).await.unwrap();
@@ -136,7 +138,7 @@ async fn a_failure_that_may_pass_is_retried_twice_and_then_final() {
                 None => tokio::time::sleep(Duration::from_millis(20)).await,
             }
         };
-        f.store.fail(&claim.lease, &fault, true).await.unwrap();
+        f.store.fail(&claim.lease, &fault, Retry::AFewTimes).await.unwrap();
     }
     let job = f.store.job(job).await.unwrap();
     assert_eq!((job.state, job.attempt), (JobState::Failed, 3));
@@ -227,7 +229,7 @@ async fn a_job_whose_workers_die_again_and_again_fails_and_says_so() {
         sqlx::query("UPDATE jobs SET not_before_ms = 0").execute(&mut *tx).await.unwrap();
         tx.commit().await.unwrap();
         f.claim(Lane::Ingest).await.unwrap();
-        f.store.reclaim(true).await.unwrap();
+        f.store.reclaim(true, false).await.unwrap();
     }
     assert_eq!(f.store.job(job).await.unwrap().state, JobState::Failed);
     assert_eq!(f.store.job(job).await.unwrap().fault.unwrap().code, "worker-lost");
@@ -263,4 +265,74 @@ async fn a_dismissed_scan_that_comes_again_gets_a_job_and_its_old_worker_changes
     assert!(f.scan(1).await.duplicate, "it is on its way now");
     let claim = f.claim(Lane::Ingest).await.unwrap();
     assert_eq!((claim.job.id, claim.job.scan), (again.job.id, Some(first.scan.id)));
+}
+
+#[tokio::test]
+async fn a_project_of_many_scans_does_not_keep_another_waiting() {
+    let f = Fixture::new().await;
+    for content in 0..50 {
+        f.scan(content).await;
+    }
+    let name = Name::parse("small").unwrap();
+    let small = f.store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
+    let other = Fixture { store: f.store.clone(), project: small, _dir: tempfile::tempdir().unwrap() };
+    let single = other.scan(100).await;
+    let first = f.claim(Lane::Ingest).await.unwrap();
+    assert_eq!(first.job.project, f.project);
+    let second = f.claim(Lane::Ingest).await.unwrap();
+    assert_eq!(
+        second.job.id, single.job.id,
+        "while one worker is at the large project, the other is at the small one"
+    );
+    for claim in [&second, &first] {
+        f.store.finish_ingest(&claim.lease).await.unwrap();
+    }
+    // With nobody at either, whose turn was longer ago comes first.
+    other.scan(101).await;
+    assert_eq!(f.claim(Lane::Ingest).await.unwrap().job.project, f.project);
+    assert_eq!(f.claim(Lane::Ingest).await.unwrap().job.project, small);
+    let mapped = [f.claim(Lane::Map).await.unwrap(), f.claim(Lane::Map).await.unwrap()];
+    assert_ne!(mapped[0].job.project, mapped[1].job.project);
+}
+
+#[tokio::test]
+async fn only_the_death_of_its_own_process_counts_against_a_job_that_has_one() {
+    let f = Fixture::new().await;
+    let (bad, good) = (f.ingested(1).await.job.id, f.ingested(2).await.job.id);
+    for _ in 0..20 {
+        let claim = f.store.claim(Lane::Map, "worker", LONG, 10, true).await.unwrap().unwrap();
+        assert_eq!(claim.members.len(), 1, "suspects go together where they can do no harm");
+        f.store.reclaim(true, true).await.unwrap();
+    }
+    let fault = Fault { code: "worker-lost".to_owned(), detail: "for the test".to_owned() };
+    let both = f.store.claim(Lane::Map, "worker", LONG, 10, true).await.unwrap().unwrap();
+    assert!(both.suspect);
+    assert_eq!(f.store.held(bad, both.lease.attempt).await.unwrap(), (Lane::Map, both.clone()));
+    f.store.crashed(&both.lease, &fault).await.unwrap();
+    for _ in 0..2 {
+        let mut tx = f.store.begin().await.unwrap();
+        sqlx::query("UPDATE jobs SET not_before_ms = 0").execute(&mut *tx).await.unwrap();
+        tx.commit().await.unwrap();
+        let alone = f.store.claim(Lane::Map, "worker", LONG, 10, true).await.unwrap().unwrap();
+        assert_eq!((alone.job.id, alone.members.len()), (bad, 0), "a batch that crashed is tried one by one");
+        f.store.crashed(&alone.lease, &fault).await.unwrap();
+    }
+    assert_eq!(f.store.job(bad).await.unwrap().fault, Some(fault));
+    let next = f.store.claim(Lane::Map, "worker", LONG, 10, true).await.unwrap().unwrap();
+    assert_eq!(next.job.id, good);
+}
+
+#[tokio::test]
+async fn what_is_not_the_jobs_doing_never_ends_it() {
+    let f = Fixture::new().await;
+    let job = f.scan(1).await.job.id;
+    let fault = Fault { code: "storage".to_owned(), detail: "for the test".to_owned() };
+    for _ in 0..10 {
+        let mut tx = f.store.begin().await.unwrap();
+        sqlx::query("UPDATE jobs SET not_before_ms = 0").execute(&mut *tx).await.unwrap();
+        tx.commit().await.unwrap();
+        let claim = f.claim(Lane::Ingest).await.unwrap();
+        f.store.fail(&claim.lease, &fault, Retry::UntilItPasses).await.unwrap();
+    }
+    assert_eq!(f.store.job(job).await.unwrap().state, JobState::Running);
 }

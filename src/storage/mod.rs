@@ -4,36 +4,57 @@
 //! Uses [`crate::project`]; used by `jobs` and `http`. Every change of state is one short `BEGIN IMMEDIATE`
 //! transaction with `synchronous = FULL`: what was answered to a client survives a power cut.
 
+mod backup;
+mod blob_reader;
+mod blob_writer;
 mod blobs;
 mod claims;
+mod damage;
 mod decisions;
 mod derived;
 mod error;
 mod garbage;
+mod hold;
 mod idempotency;
+mod integrity;
 mod job_rows;
 mod keys;
 #[cfg(test)]
 mod lease_tests;
+mod ledger;
+mod orphans;
 mod pins;
 mod projects;
 mod publication;
+mod references;
 mod rows;
 mod scans;
+mod setbacks;
 mod store;
+mod thinning;
 mod upload_files;
 mod uploads;
 mod versions;
 
-pub use blobs::{BlobId, BlobReader, BlobStore, BlobWriter, StoredBlob};
+pub use backup::{Copied, Sharing, backup, restore};
+pub use blob_reader::BlobReader;
+pub use blob_writer::BlobWriter;
+pub use blobs::{BlobId, BlobStore, StoredBlob};
 pub use claims::{Claim, Lease, Measures};
+pub use damage::Damage;
 pub use derived::Owner;
-pub use error::StorageError;
+pub use error::{StorageError, Trouble};
+pub use hold::Hold;
 pub use idempotency::KeptAnswer;
 pub use job_rows::JobFilter;
 pub use keys::{Keys, NewKey};
+pub use ledger::Finding;
 pub use pins::FreshBlob;
 pub use publication::{NewVersion, Publication, ScanChange};
+pub use references::{Reference, Role};
 pub use scans::{Admission, NewScan};
+pub use setbacks::Retry;
 pub use store::{Page, Store};
+pub use thinning::KEPT_WHOLE;
 pub use upload_files::{UploadFile, UploadFiles};
+pub use versions::{pack, unpack};

@@ -5,6 +5,7 @@ use sqlx::{Sqlite, Transaction};
 
 use super::claims::check;
 use super::rows::to_json;
+use super::thinning::thin;
 use super::{BlobId, Lease, StorageError, Store};
 use crate::project::{
     ContentKey, Fault, JobId, JobKind, ProjectId, ScanId, ScanState, Standing, Timestamp, VersionNumber,
@@ -90,6 +91,7 @@ impl Store {
                 .bind(now.0)
                 .execute(&mut *tx)
                 .await?;
+            thin(&mut tx, &project, number).await?;
         }
         for (a, b, result) in &publication.pairs {
             sqlx::query("INSERT OR REPLACE INTO pairs VALUES (?, ?, ?, ?, ?)")

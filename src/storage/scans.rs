@@ -8,7 +8,7 @@ use super::rows::{count, json, parsed, to_json, word};
 use super::{BlobId, Page, StorageError, Store};
 use crate::project::{
     ContentKey, Interpretation, Job, JobId, JobKind, Lane, Name, ProjectId, Scan, ScanId, ScanState,
-    Timestamp, UploadEnd,
+    Standing, Timestamp, UploadEnd,
 };
 
 /// An upload that is safe on disk and waits to be acknowledged.
@@ -97,6 +97,16 @@ impl Store {
         rows.iter()
             .map(|row| Ok((scan(row)?, row.try_get::<Option<i64>, _>("deleted_ms")?.is_some())))
             .collect()
+    }
+
+    /// Where the scans of the newest version stand, as far as their own rows tell; scans that were deleted are left out. For when
+    /// the version itself cannot be read.
+    pub async fn standings(&self, project: ProjectId) -> Result<Vec<(ScanId, Standing)>, StorageError> {
+        let scans = self.scans_ever(project).await?.into_iter().filter(|(_, deleted)| !deleted);
+        Ok(scans
+            .filter(|(scan, _)| matches!(scan.state, ScanState::Registered | ScanState::Waiting))
+            .filter_map(|(scan, _)| Some((scan.id, scan.standing?)))
+            .collect())
     }
 
     /// Natural resolutions (metres) of the first `limit` scans by arrival that can take part and are decoded.

@@ -23,7 +23,12 @@ impl UploadFiles {
     /// Opens the folder `root` and makes it if needed.
     pub(super) fn open(root: &Path) -> Result<Self, StorageError> {
         fs::create_dir_all(root).map_err(StorageError::io("making the folder of uploads"))?;
-        Ok(Self { root: root.into() })
+        Ok(Self::at_folder(root))
+    }
+
+    /// The folder `root`, whoever made it.
+    pub(super) fn at_folder(root: &Path) -> Self {
+        Self { root: root.into() }
     }
 
     pub(super) fn path(&self, id: UploadId) -> PathBuf {

@@ -1,5 +1,10 @@
 //! Rows of model versions and of the pairs behind them.
 
+use std::io::BufReader;
+
+use flate2::Compression;
+use flate2::read::ZlibDecoder;
+use flate2::write::ZlibEncoder;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
@@ -37,16 +42,17 @@ impl Store {
         let (version, _) = self.version(project, number).await?;
         let (blobs, id) = (self.blobs.clone(), BlobId::parse(&version.content)?);
         let read = move || {
-            let bytes = blobs.get(id)?;
-            serde_json::from_slice(&bytes).map_err(|e| StorageError::BadRow {
-                column: "the content of a version",
-                value: e.to_string(),
-            })
+            let content = unpack(&blobs.get(id)?);
+            content.inspect_err(|_| blobs.note_unreadable(id))
         };
         let content = tokio::task::spawn_blocking(read)
             .await
-            .map_err(|e| StorageError::io("reading a version")(std::io::Error::other(e)))??;
-        Ok((number, content))
+            .map_err(|e| StorageError::io("reading a version")(std::io::Error::other(e)))?;
+        if content.as_ref().is_err_and(StorageError::is_damage) {
+            // It is made again at once: readers wait for it.
+            self.settle_damage().await?;
+        }
+        Ok((number, content?))
     }
 
     /// Versions of a project, oldest first.
@@ -70,6 +76,25 @@ impl Store {
             .await?;
         rows.iter().map(|row| Ok(row.try_get("result")?)).collect()
     }
+}
+
+/// What readers see, as it is stored: JSON, compressed (zlib, RFC 1950), because most of it repeats.
+pub fn pack(content: &ModelContent) -> Result<Vec<u8>, StorageError> {
+    let mut out = ZlibEncoder::new(Vec::new(), Compression::default());
+    serde_json::to_writer(&mut out, content).map_err(|e| unreadable(&e))?;
+    out.finish().map_err(StorageError::io("compressing a version"))
+}
+
+/// Reads what [`pack`] wrote. The first programs stored plain JSON, which begins with a brace.
+pub fn unpack(bytes: &[u8]) -> Result<ModelContent, StorageError> {
+    if bytes.first() == Some(&b'{') {
+        return serde_json::from_slice(bytes).map_err(|e| unreadable(&e));
+    }
+    serde_json::from_reader(BufReader::new(ZlibDecoder::new(bytes))).map_err(|e| unreadable(&e))
+}
+
+fn unreadable(error: &serde_json::Error) -> StorageError {
+    StorageError::BadRow { column: "the content of a version", value: error.to_string() }
 }
 
 fn version(row: &SqliteRow) -> Result<Version, StorageError> {

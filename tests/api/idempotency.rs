@@ -126,14 +126,16 @@ async fn a_key_whose_request_still_runs_is_refused() {
     let (sender, receiver) = tokio::sync::mpsc::channel::<Result<Vec<u8>, std::io::Error>>(2);
     let pieces = futures_util::stream::unfold(receiver, |mut r| async { r.recv().await.map(|p| (p, r)) });
     let first = tokio::spawn(post(&server, &path, "k").body(Body::wrap_stream(pieces)).send());
-    let whole = room(0.0);
-    sender.send(Ok(whole[..200].to_vec())).await.unwrap();
+    let mut whole = room(0.0);
+    // So much that the first part of it goes to the disk before the rest is there.
+    whole.resize(3 << 20, b'\n');
+    sender.send(Ok(whole[..2 << 20].to_vec())).await.unwrap();
     while server.files("blobs/partial") == 0 {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     let second = post(&server, &path, "k").body("ply").send().await.unwrap();
     problem(second, 409, "request-running").await;
-    sender.send(Ok(whole[200..].to_vec())).await.unwrap();
+    sender.send(Ok(whole[2 << 20..].to_vec())).await.unwrap();
     drop(sender);
     assert_eq!(first.await.unwrap().unwrap().status(), 202);
     let again = post(&server, &path, "k").body(whole).send().await.unwrap();

@@ -13,7 +13,8 @@ pub(super) fn peak_bytes() -> Option<u64> {
     peak_in(&fs::read_to_string("/proc/self/status").ok()?)
 }
 
-fn peak_in(status: &str) -> Option<u64> {
+/// The peak in the text of a process's `/proc/…/status`, bytes.
+pub(super) fn peak_in(status: &str) -> Option<u64> {
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
     let kilobytes: u64 = line.trim().strip_suffix("kB")?.trim_end().parse().ok()?;
     kilobytes.checked_mul(1024)

@@ -1,8 +1,9 @@
 //! `cairn bench`: what the engine is worth, measured on scenes with known truth. Measures are in [`crate::evaluate`], other strategies
-//! in [`crate::baseline`]; here scenes are read, the engine is run and timed, and figures are printed. `pairs.rs` is a measure of its own;
-//! all other files are `recall`.
+//! in [`crate::baseline`]; here scenes are read, the engine is run and timed, and figures are printed. `pairs.rs` and `load/`, which
+//! measures the service, are measures of their own; all other files are `recall`.
 
 mod clock;
+mod load;
 mod markdown;
 mod measure;
 mod memory;
@@ -29,6 +30,7 @@ pub struct BenchArgs {
 enum Measure {
     Recall(recall::RecallArgs),
     Pairs(pairs::PairsArgs),
+    Load(load::LoadArgs),
 }
 
 /// Runs the command.
@@ -39,5 +41,6 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     match &args.measure {
         Measure::Recall(args) => recall::run(args),
         Measure::Pairs(args) => pairs::run(args).map(|()| ExitCode::SUCCESS),
+        Measure::Load(args) => load::run(args),
     }
 }

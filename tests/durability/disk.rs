@@ -1,0 +1,96 @@
+//! Disks that fill up and fail: what was acknowledged is there, what was not is refused with 507 or 503, and the service works again
+//! when the disk does.
+
+use std::collections::BTreeMap;
+
+use reqwest::StatusCode;
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{Connection as _, SqliteConnection};
+
+use crate::process::{Faults, Process, check, room, speck};
+
+#[tokio::test]
+async fn a_full_disk_refuses_uploads_and_works_again_when_there_is_space() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let mut service = Process::with(&data, &[], Some(&faults));
+    let project = service.project().await;
+    let first = service.accepted(&project, room(0.0)).await;
+    faults.set("write enospc 0 /data/");
+    for seed in 0..3 {
+        let refused = service.upload(&project, speck(seed)).await.unwrap();
+        assert_eq!(refused.status(), StatusCode::INSUFFICIENT_STORAGE);
+        assert!(refused.headers().contains_key("retry-after"));
+    }
+    let scans = service.json(&format!("{project}/scans")).await;
+    assert_eq!(scans["items"].as_array().unwrap().len(), 1, "readers are served, and nothing half is there");
+    // Longer than all attempts of a job that is to blame itself.
+    tokio::time::sleep(std::time::Duration::from_secs(5)).await;
+    assert!(!service.has_died());
+    faults.set("");
+    let second = service.accepted(&project, room(0.4)).await;
+    for upload in [first, second] {
+        assert_eq!(service.ended(&upload["job"]).await["status"], "succeeded");
+    }
+    service.kill();
+    assert_eq!(check(&data, &[]).0, 0);
+}
+
+#[tokio::test]
+async fn whichever_write_sync_or_rename_fails_what_was_acknowledged_is_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let mut service = Process::with(&data, &[], Some(&faults));
+    let project = service.project().await;
+    let (mut acknowledged, mut refused, mut seed) = (Vec::new(), BTreeMap::<u16, usize>::new(), 0);
+    let kinds =
+        [("write enospc", 14), ("write eio", 14), ("write short", 4), ("sync eio", 10), ("rename eio", 1)];
+    for (kind, calls) in kinds {
+        for n in 0..calls {
+            seed += 1;
+            faults.set(&format!("{kind} {n} /data/"));
+            let answer = service.upload(&project, speck(seed)).await.unwrap();
+            match answer.status() {
+                StatusCode::ACCEPTED => {
+                    let body: serde_json::Value = answer.json().await.unwrap();
+                    acknowledged.push((body["scan"]["id"].as_str().unwrap().to_owned(), seed));
+                }
+                status => *refused.entry(status.as_u16()).or_default() += 1,
+            }
+            faults.set("");
+        }
+    }
+    assert!(refused.keys().all(|status| [503, 507].contains(status)), "{refused:?}");
+    assert!(
+        refused.values().sum::<usize>() > 10 && acknowledged.len() > 5,
+        "{refused:?} {}",
+        acknowledged.len()
+    );
+    service.kill();
+    let mut service = Process::start(&data);
+    for (id, seed) in &acknowledged {
+        let original = reqwest::get(format!("{}{project}/scans/{id}/original", service.url)).await.unwrap();
+        assert_eq!(original.bytes().await.unwrap(), speck(*seed), "scan {id}");
+    }
+    for job in service.all_ended(&project).await {
+        assert_ne!(job["problem"]["type"], "urn:cairn:problem:storage", "{job}");
+    }
+    service.kill();
+    assert_eq!(check(&data, &[]), (0, check(&data, &[]).1));
+}
+
+#[tokio::test]
+async fn a_database_that_another_process_holds_is_told_as_busy_and_waited_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    let service = Process::start(&data);
+    let project = service.project().await;
+    let options = SqliteConnectOptions::new().filename(data.join("cairn.sqlite"));
+    let mut other = SqliteConnection::connect_with(&options).await.unwrap();
+    sqlx::raw_sql("BEGIN IMMEDIATE").execute(&mut other).await.unwrap();
+    let refused = service.upload(&project, speck(1)).await.unwrap();
+    assert_eq!(refused.status(), StatusCode::SERVICE_UNAVAILABLE);
+    service.json(&project).await;
+    sqlx::raw_sql("ROLLBACK").execute(&mut other).await.unwrap();
+    service.accepted(&project, speck(1)).await;
+}

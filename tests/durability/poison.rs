@@ -1,0 +1,84 @@
+//! Scans whose work kills or hangs the process that does it: they are set aside and say why, and their project goes on.
+
+use serde_json::Value;
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{Connection as _, Row as _, SqliteConnection};
+
+use crate::process::{Faults, Process, room};
+
+fn failed(job: &Value, code: &str) {
+    assert_eq!(job["status"], "failed", "{job}");
+    assert_eq!(job["problem"]["type"], format!("urn:cairn:problem:{code}"), "{job}");
+}
+
+#[tokio::test]
+async fn an_upload_that_crashes_or_hangs_its_reader_is_set_aside_and_the_service_lives() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let mut service = Process::with(&data, &["--job-seconds", "3", "--workers", "2"], Some(&faults));
+    let project = service.project().await;
+    let [crash, hang] = [room(7.0), room(8.0)];
+    let name = |bytes: &[u8]| blake3::hash(bytes).to_hex().to_string();
+    faults.set(&format!("open abort 0 {}\nopen loop 0 {}", name(&crash), name(&hang)));
+    let (crash, hang) = (service.accepted(&project, crash).await, service.accepted(&project, hang).await);
+    let mut good = Vec::new();
+    for shift in [0.0, 0.4, 0.8] {
+        good.push(service.accepted(&project, room(shift)).await);
+    }
+    for upload in &good {
+        assert_eq!(service.ended(&upload["job"]).await["status"], "succeeded");
+    }
+    failed(&service.ended(&crash["job"]).await, "worker-lost");
+    failed(&service.ended(&hang["job"]).await, "time-limit");
+    assert!(!service.has_died());
+    // Whoever sends it again gets another chance.
+    faults.set("");
+    let again = service.accepted(&project, room(7.0)).await;
+    assert_eq!(service.ended(&again["job"]).await["status"], "succeeded");
+}
+
+#[tokio::test]
+async fn a_scan_that_kills_the_mapper_is_found_out_and_the_others_are_mapped() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let mut service = Process::with(&data, &[], Some(&faults));
+    // What is prepared of a scan depends on its bytes only, so that another project tells the name of the file.
+    let elsewhere = service.project().await;
+    let known = service.accepted(&elsewhere, room(7.0)).await;
+    service.ended(&known["job"]).await;
+    let options = SqliteConnectOptions::new().filename(data.join("cairn.sqlite")).read_only(true);
+    let mut database = SqliteConnection::connect_with(&options).await.unwrap();
+    let row = sqlx::query("SELECT blob FROM derived").fetch_one(&mut database).await.unwrap();
+    faults.set(&format!("open abort 0 {}", row.get::<String, _>("blob")));
+    let project = service.project().await;
+    let mut uploads = Vec::new();
+    for shift in [0.0, 7.0, 0.4] {
+        uploads.push(service.accepted(&project, room(shift)).await);
+    }
+    let mut deaths = 0;
+    let begun = std::time::Instant::now();
+    let ended = loop {
+        assert!(begun.elapsed().as_secs() < 100, "the jobs do not end");
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        if service.has_died() {
+            deaths += 1;
+            service = Process::with(&data, &[], Some(&faults));
+        }
+        let mut jobs = Vec::new();
+        for upload in &uploads {
+            let at = format!("{}/v1/jobs/{}", service.url, upload["job"]["id"].as_str().unwrap());
+            if let Ok(answer) = reqwest::get(at).await
+                && let Ok(job) = answer.json::<Value>().await
+                && !job["finished"].is_null()
+            {
+                jobs.push(job);
+            }
+        }
+        if jobs.len() == uploads.len() {
+            break jobs;
+        }
+    };
+    assert!(deaths <= 2, "after that it had a process of its own: {deaths}");
+    failed(&ended[1], "worker-lost");
+    assert_eq!((&ended[0]["status"], &ended[2]["status"]), (&"succeeded".into(), &"succeeded".into()));
+}
