@@ -16,6 +16,8 @@ RUN --mount=type=cache,target=/usr/local/cargo/registry \
     && mkdir /empty
 
 FROM debian:trixie-slim
+# Whom webhooks by https are believed.
+COPY --from=build /etc/ssl/certs/ca-certificates.crt /etc/ssl/certs/ca-certificates.crt
 COPY --from=build /cairn /usr/local/bin/cairn
 COPY LICENSE-MIT LICENSE-APACHE /usr/share/doc/cairn/
 # A new volume takes over owner and mode of the directory it is mounted on.

@@ -6,10 +6,12 @@ use std::sync::Arc;
 
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
+use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::Config;
-use crate::http::{Api, Openness, openapi_yaml, router};
+use crate::http::{self, Access, Api, ConnectionLimits, Openness, TlsError, acceptor, openapi_yaml, router};
+use crate::jobs::webhooks::{Courier, SendError};
 use crate::jobs::{Compute, Exports, Intake, Resumable, Workers};
 use crate::storage::{StorageError, Store};
 
@@ -25,6 +27,12 @@ pub enum StartError {
     /// The address cannot be listened on.
     #[error("cannot listen on {0}: {1}")]
     Listen(SocketAddr, std::io::Error),
+    /// Webhooks cannot be reached.
+    #[error("webhooks: {0}")]
+    Webhooks(#[from] SendError),
+    /// Connections cannot be encrypted.
+    #[error("TLS: {0}")]
+    Tls(#[from] TlsError),
     /// Strangers could reach it, and there is no key.
     #[error(
         "{0} can be reached from other machines, and no key is valid: make one with `cairn key create`, or say \
@@ -41,6 +49,7 @@ pub enum StartError {
 pub struct Running {
     /// Where it listens.
     pub addr: SocketAddr,
+    scheme: &'static str,
     stop: CancellationToken,
     server: JoinHandle<()>,
 }
@@ -55,7 +64,7 @@ impl Running {
     /// Where it can be reached from this machine.
     #[must_use]
     pub fn url(&self) -> String {
-        format!("http://{}", self.addr)
+        format!("{}://{}", self.scheme, self.addr)
     }
 
     /// Waits until the service has stopped by itself or by its stopper.
@@ -79,6 +88,8 @@ const DRAIN: std::time::Duration = std::time::Duration::from_secs(10);
 pub async fn start(config: Config) -> Result<Running, StartError> {
     let store =
         Store::open(&config.data).await.map_err(|error| StartError::Data(config.data.clone(), error))?;
+    let tls = config.tls.as_ref().map(|(certificate, key)| acceptor(certificate, key)).transpose()?;
+    store.limit_projects(config.project_limits);
     let openness = Openness::of(config.allow_anonymous, config.listen);
     if openness == Openness::Closed
         && !store.keys().any_valid().await.map_err(|error| StartError::Data(config.data.clone(), error))?
@@ -97,7 +108,10 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         resumable: Resumable::new(store.clone(), intake.clone(), config.upload_expiry, stop.clone()),
         intake,
         exports: Exports::new(store.clone(), compute.clone(), config.workers.max_points),
-        openness,
+        access: Access { openness, origins: config.origins.into(), load: config.load },
+        webhooks: Arc::new(config.webhooks.targets.clone()),
+        metrics: Arc::default(),
+        readiness: Arc::default(),
         stop: stop.clone(),
         openapi: Arc::from(openapi_yaml().map_err(|problem| StartError::Description(problem.detail))?),
     };
@@ -105,23 +119,44 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         .await
         .map_err(|error| StartError::Data(config.data.clone(), error))?;
     tracing::info!(%addr, data = %config.data.display(), "listening");
-    let server = tokio::spawn(serve(listener, api, workers, store, stop.clone()));
-    Ok(Running { addr, stop, server })
+    let courier = Courier::new(store.clone(), config.webhooks)?;
+    let scheme = if tls.is_some() { "https" } else { "http" };
+    let entrance = Entrance { listener, limits: config.connections, tls };
+    let server = tokio::spawn(serve(entrance, api, workers, courier, store, stop.clone()));
+    Ok(Running { addr, scheme, stop, server })
 }
 
-async fn serve(listener: TcpListener, api: Api, workers: Workers, store: Store, stop: CancellationToken) {
-    let app = router(api);
-    let graceful = axum::serve(listener, app).with_graceful_shutdown(stop.clone().cancelled_owned());
+/// Where requests come in.
+struct Entrance {
+    listener: TcpListener,
+    limits: ConnectionLimits,
+    tls: Option<TlsAcceptor>,
+}
+
+async fn serve(
+    entrance: Entrance,
+    api: Api,
+    workers: Workers,
+    courier: Courier,
+    store: Store,
+    stop: CancellationToken,
+) {
+    let courier = tokio::spawn(courier.run(stop.clone()));
+    let Entrance { listener, limits, tls } = entrance;
+    let graceful = http::serve(listener, router(api), limits, tls, stop.clone());
     let overdue = async {
         stop.cancelled().await;
         tokio::time::sleep(DRAIN).await;
     };
     tokio::select! {
-        ended = graceful => if let Err(error) = ended { tracing::error!(%error, "the listener failed") },
+        () = graceful => {}
         () = overdue => tracing::warn!("answers that did not end in time are cut off"),
     }
     stop.cancel();
     workers.stop().await;
+    if let Err(error) = courier.await {
+        tracing::error!(%error, "the courier of webhooks ended badly");
+    }
     store.close().await;
     tracing::info!("stopped");
 }

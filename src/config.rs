@@ -1,13 +1,20 @@
 //! Settings of the service: flags, then environment (`CAIRN_…`), then a TOML file, then the defaults.
 
+use std::fmt::Display;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::time::Duration;
 
+use axum::http::HeaderValue;
+use axum::http::uri::Authority;
 use clap::Args;
 use serde::Deserialize;
 
+use crate::http::{ConnectionLimits, LoadLimits};
+use crate::jobs::webhooks::{CourierOptions, Targets};
 use crate::jobs::{Isolated, Isolation, WorkerOptions};
+use crate::project::Limits;
 
 /// Every setting, each possibly not given. The same names serve as flags, in the environment and in the file.
 #[derive(Debug, Clone, Default, PartialEq, Args, Deserialize)]
@@ -64,13 +71,52 @@ pub struct Settings {
     #[arg(skip)]
     #[serde(skip)]
     pub program: Option<PathBuf>,
+    /// PEM file with the certificate chain, the server's own first; with `tls-key`, connections are encrypted
+    #[arg(long, env = "CAIRN_TLS_CERT", value_name = "FILE")]
+    pub tls_cert: Option<PathBuf>,
+    /// PEM file with the private key of the certificate
+    #[arg(long, env = "CAIRN_TLS_KEY", value_name = "FILE")]
+    pub tls_key: Option<PathBuf>,
+    /// Origins whose pages may use the API, such as `https://viewer.example`, separated by commas [default: none]
+    #[arg(long, env = "CAIRN_CORS_ORIGINS", value_name = "ORIGINS", value_delimiter = ',')]
+    pub cors_origins: Option<Vec<String>>,
+    /// Connections at once; more wait [default: 1024]
+    #[arg(long, env = "CAIRN_MAX_CONNECTIONS", value_name = "N")]
+    pub max_connections: Option<u64>,
+    /// Seconds for which a connection may be silent between requests, take for the head of one, or not read an answer [default: 60]
+    #[arg(long, env = "CAIRN_IDLE_SECONDS", value_name = "SECONDS")]
+    pub idle_seconds: Option<u64>,
+    /// Jobs of all projects that may wait or run; with more, work is refused with 503 [default: 100000]
+    #[arg(long, env = "CAIRN_MAX_OPEN_JOBS", value_name = "N")]
+    pub max_open_jobs: Option<u64>,
+    /// Bytes of disk that must be free; with less, work is refused with 503 [default: 1073741824, which is 1 GiB]
+    #[arg(long, env = "CAIRN_MIN_FREE_BYTES", value_name = "BYTES")]
+    pub min_free_bytes: Option<u64>,
+    /// Bytes of scans that a project may have [default: no limit]
+    #[arg(long, env = "CAIRN_PROJECT_MAX_BYTES", value_name = "BYTES")]
+    pub project_max_bytes: Option<u64>,
+    /// Scans that a project may have [default: no limit]
+    #[arg(long, env = "CAIRN_PROJECT_MAX_SCANS", value_name = "N")]
+    pub project_max_scans: Option<u64>,
+    /// Jobs of a project that may wait or run [default: no limit]
+    #[arg(long, env = "CAIRN_PROJECT_MAX_QUEUED_JOBS", value_name = "N")]
+    pub project_max_queued_jobs: Option<u64>,
+    /// Hosts to which webhooks may be sent, such as hooks.example.com or *.example.com, separated by commas [default: none]
+    #[arg(long, env = "CAIRN_WEBHOOK_HOSTS", value_name = "HOSTS", value_delimiter = ',')]
+    pub webhook_hosts: Option<Vec<String>>,
+    /// Networks that are not public, but in which listed hosts may be, such as 10.1.0.0/16, separated by commas [default: none]
+    #[arg(long, env = "CAIRN_WEBHOOK_NETWORKS", value_name = "NETWORKS", value_delimiter = ',')]
+    pub webhook_networks: Option<Vec<String>>,
+    /// Seconds until a message that a webhook did not take is sent again; doubles each time [default: 10]
+    #[arg(long, env = "CAIRN_WEBHOOK_RETRY_SECONDS", value_name = "SECONDS")]
+    pub webhook_retry_seconds: Option<u64>,
     /// Write logs as JSON [default: false]
     #[arg(long, env = "CAIRN_LOG_JSON", value_name = "BOOL", num_args = 0..=1, default_missing_value = "true")]
     pub log_json: Option<bool>,
 }
 
 /// What the service runs with.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Config {
     /// Address to listen on.
     pub listen: SocketAddr,
@@ -89,6 +135,18 @@ pub struct Config {
     /// Whether requests without a key are served whoever sends them. If not, then only those from this machine, and only
     /// until the first key is made.
     pub allow_anonymous: bool,
+    /// Certificate chain and private key, PEM files; without them connections are not encrypted.
+    pub tls: Option<(PathBuf, PathBuf)>,
+    /// Origins whose pages may use the API.
+    pub origins: Vec<HeaderValue>,
+    /// What connections may do.
+    pub connections: ConnectionLimits,
+    /// When no more work is taken on.
+    pub load: LoadLimits,
+    /// What each project may have.
+    pub project_limits: Limits,
+    /// How webhooks are told.
+    pub webhooks: CourierOptions,
     /// Whether logs are JSON.
     pub log_json: bool,
 }
@@ -115,6 +173,22 @@ pub enum ConfigError {
         /// Where and why.
         source: toml::de::Error,
     },
+    /// A certificate without its key, or the other way round.
+    #[error("tls-cert and tls-key only make sense together")]
+    HalfTls,
+    /// An item of a list that cannot be read.
+    #[error("{setting}: `{item}`: {why}")]
+    BadItem {
+        /// Which setting.
+        setting: &'static str,
+        /// The item.
+        item: String,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// No origin of pages.
+    #[error("`{0}` is no origin: it must be such as https://viewer.example:8443, without a path")]
+    NoOrigin(String),
     /// A number that makes no sense.
     #[error("{setting} is {value}; it must be between {least} and {most}")]
     OutOfRange {
@@ -157,6 +231,19 @@ impl Settings {
             job_seconds: self.job_seconds.or(other.job_seconds),
             isolation: self.isolation.or(other.isolation),
             program: self.program.or(other.program),
+            tls_cert: self.tls_cert.or(other.tls_cert),
+            tls_key: self.tls_key.or(other.tls_key),
+            cors_origins: self.cors_origins.or(other.cors_origins),
+            max_connections: self.max_connections.or(other.max_connections),
+            idle_seconds: self.idle_seconds.or(other.idle_seconds),
+            max_open_jobs: self.max_open_jobs.or(other.max_open_jobs),
+            min_free_bytes: self.min_free_bytes.or(other.min_free_bytes),
+            project_max_bytes: self.project_max_bytes.or(other.project_max_bytes),
+            project_max_scans: self.project_max_scans.or(other.project_max_scans),
+            project_max_queued_jobs: self.project_max_queued_jobs.or(other.project_max_queued_jobs),
+            webhook_hosts: self.webhook_hosts.or(other.webhook_hosts),
+            webhook_networks: self.webhook_networks.or(other.webhook_networks),
+            webhook_retry_seconds: self.webhook_retry_seconds.or(other.webhook_retry_seconds),
             log_json: self.log_json.or(other.log_json),
         }
     }
@@ -212,6 +299,33 @@ impl Settings {
                 grace: Duration::from_secs(20),
             },
             allow_anonymous: self.allow_anonymous.unwrap_or(false),
+            tls: both(self.tls_cert, self.tls_key)?,
+            origins: self
+                .cors_origins
+                .unwrap_or_default()
+                .iter()
+                .map(|o| origin(o))
+                .collect::<Result<_, _>>()?,
+            connections: ConnectionLimits {
+                most: within("max-connections", self.max_connections.unwrap_or(1024), 1, 1 << 20)? as usize,
+                idle: seconds("idle-seconds", self.idle_seconds, 60)?,
+            },
+            load: LoadLimits {
+                open_jobs: within("max-open-jobs", self.max_open_jobs.unwrap_or(100_000), 1, 1 << 40)?,
+                free_bytes: self.min_free_bytes.unwrap_or(1 << 30),
+            },
+            project_limits: Limits {
+                bytes: self.project_max_bytes,
+                scans: self.project_max_scans,
+                queued_jobs: self.project_max_queued_jobs,
+            },
+            webhooks: CourierOptions {
+                targets: Targets {
+                    hosts: listed("webhook-hosts", self.webhook_hosts)?,
+                    networks: listed("webhook-networks", self.webhook_networks)?,
+                },
+                pause: seconds("webhook-retry-seconds", self.webhook_retry_seconds, 10)?,
+            },
             log_json: self.log_json.unwrap_or(false),
         })
     }
@@ -228,6 +342,43 @@ fn machine_memory() -> u64 {
     let line = info.lines().find_map(|line| line.strip_prefix("MemTotal:"));
     let kib: Option<u64> = line.and_then(|line| line.trim().trim_end_matches(" kB").parse().ok());
     kib.map_or(8 << 30, |kib| kib * 1024).max(LEAST_MEMORY * 2)
+}
+
+fn both(
+    certificate: Option<PathBuf>,
+    key: Option<PathBuf>,
+) -> Result<Option<(PathBuf, PathBuf)>, ConfigError> {
+    match (certificate, key) {
+        (Some(certificate), Some(key)) => Ok(Some((certificate, key))),
+        (None, None) => Ok(None),
+        _ => Err(ConfigError::HalfTls),
+    }
+}
+
+fn listed<T: FromStr<Err: Display>>(
+    setting: &'static str,
+    items: Option<Vec<String>>,
+) -> Result<Vec<T>, ConfigError> {
+    let read = |item: String| {
+        item.trim().parse().map_err(|why: T::Err| ConfigError::BadItem {
+            setting,
+            why: why.to_string(),
+            item,
+        })
+    };
+    items.unwrap_or_default().into_iter().map(read).collect()
+}
+
+/// Reads an origin as browsers send it: scheme, host, and the port unless it is the scheme's own.
+fn origin(text: &str) -> Result<HeaderValue, ConfigError> {
+    let bad = || ConfigError::NoOrigin(text.to_owned());
+    let text = text.trim().trim_end_matches('/').to_ascii_lowercase();
+    let (scheme, host) = text.split_once("://").ok_or_else(bad)?;
+    host.parse::<Authority>().ok().filter(|a| !a.as_str().contains('@')).ok_or_else(bad)?;
+    if !matches!(scheme, "http" | "https") {
+        return Err(bad());
+    }
+    HeaderValue::from_str(&text).map_err(|_| bad())
 }
 
 fn within(setting: &'static str, value: u64, least: u64, most: u64) -> Result<u64, ConfigError> {
@@ -263,5 +414,27 @@ mod tests {
         let settings = Settings { workers: Some(0), ..Settings::default() };
         let message = settings.resolve().unwrap_err().to_string();
         assert_eq!(message, "workers is 0; it must be between 1 and 256");
+    }
+
+    #[test]
+    fn half_of_tls_and_what_is_no_origin_are_refused() {
+        let half = Settings { tls_cert: Some("a.pem".into()), ..Settings::default() };
+        assert!(matches!(half.resolve(), Err(ConfigError::HalfTls)));
+        let with = |origin: &str| {
+            Settings { cors_origins: Some(vec![origin.to_owned()]), ..Settings::default() }.resolve()
+        };
+        assert_eq!(with("https://Viewer.example/").unwrap().origins, ["https://viewer.example"]);
+        for bad in [
+            "*",
+            "viewer.example",
+            "https://a/b",
+            "https://",
+            "null",
+            "ftp://a",
+            "https://a@b",
+            "https://a b",
+        ] {
+            assert!(matches!(with(bad), Err(ConfigError::NoOrigin(_))), "{bad}");
+        }
     }
 }

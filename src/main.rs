@@ -18,7 +18,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    Serve(serve::ServeArgs),
+    Serve(Box<serve::ServeArgs>),
     Key(key::KeyArgs),
     Register(register::RegisterArgs),
     Demo(demo::DemoArgs),
@@ -43,7 +43,7 @@ fn main() -> ExitCode {
 
 fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
-        Command::Serve(args) => serve::run(args)?,
+        Command::Serve(args) => serve::run(*args)?,
         Command::Key(args) => key::run(args)?,
         Command::Register(args) => return register::run(&args),
         Command::Demo(args) => return demo::run(&args),

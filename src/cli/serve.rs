@@ -24,7 +24,7 @@ pub struct ServeArgs {
 pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     let file = args.config.as_deref().map(Settings::from_file).transpose()?.unwrap_or_default();
     let config = Settings { program: Some(this_program()), ..args.settings.or(file) }.resolve()?;
-    telemetry::init(config.log_json)?;
+    let _telemetry = telemetry::init(config.log_json)?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
         let running = app::start(config).await?;

@@ -46,7 +46,7 @@ const RESERVED: u64 = 4 << 30;
 /// If settings make no sense or the pool cannot be started.
 pub fn run(args: &WorkArgs) -> anyhow::Result<ExitCode> {
     yield_to_clients();
-    telemetry::init(args.log_json)?;
+    let _telemetry = telemetry::init(args.log_json)?;
     die_with_the_service()?;
     // A computation that needs more fails here, and not the service or its neighbours; and nobody wants its memory on disk.
     let most = args.memory_bytes.saturating_add(RESERVED);

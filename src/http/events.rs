@@ -4,7 +4,7 @@ use std::convert::Infallible;
 use std::time::Duration;
 
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderName};
+use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::Stream;
@@ -30,6 +30,7 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
     ("last-event-id" = Option<String>, Header, description = "The id of the last event that the client has")),
     responses(
     (status = 200, description = "The events", body = String, content_type = "text/event-stream"),
+    (status = 204, description = "The job has ended, and the client has its last event"),
     Problems))]
 pub(super) async fn follow_job(
     State(api): State<Api>,
@@ -38,7 +39,13 @@ pub(super) async fn follow_job(
 ) -> Result<Response, Problem> {
     let seen = headers.get("last-event-id").and_then(|v| v.to_str().ok()?.parse().ok()).unwrap_or(0);
     let changes = api.store.changes();
-    api.store.job(id).await?;
+    let job = api.store.job(id).await?;
+    // A number that is not its own, such as from before a backup was restored, tells nothing.
+    let seen = if seen > job.revision { 0 } else { seen };
+    if job.state.is_final() && seen == job.revision {
+        // A client that comes back with nothing left to hear is told not to come again.
+        return Ok(StatusCode::NO_CONTENT.into_response());
+    }
     let follower = Follower { store: api.store, id, seen, changes, ended: false, stop: api.stop };
     let sse = Sse::new(events(follower)).keep_alive(KeepAlive::new().interval(KEEP_ALIVE));
     let no_buffering = [(HeaderName::from_static("x-accel-buffering"), "no")];

@@ -1,10 +1,13 @@
 //! Extractors whose refusals are problems too.
 
+use std::time::Duration;
+
 use axum::extract::rejection::JsonRejection;
 use axum::extract::{FromRequest, FromRequestParts, Path, Request};
 use axum::http::StatusCode;
 use axum::http::request::Parts;
 use serde::de::DeserializeOwned;
+use tokio::time::timeout;
 
 use super::Problem;
 
@@ -27,6 +30,9 @@ pub(super) fn no_id() -> Problem {
     Problem::not_found("the path holds something that is no id")
 }
 
+/// How long a JSON body may take: it is small.
+const PATIENCE: Duration = Duration::from_secs(30);
+
 /// A JSON body.
 pub(super) struct Body<T>(pub T);
 
@@ -34,9 +40,14 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for Body<T> {
     type Rejection = Problem;
 
     async fn from_request(request: Request, state: &S) -> Result<Self, Problem> {
-        match axum::Json::<T>::from_request(request, state).await {
-            Ok(axum::Json(body)) => Ok(Self(body)),
-            Err(rejection) => Err(refusal(&rejection)),
+        match timeout(PATIENCE, axum::Json::<T>::from_request(request, state)).await {
+            Ok(Ok(axum::Json(body))) => Ok(Self(body)),
+            Ok(Err(rejection)) => Err(refusal(&rejection)),
+            Err(_) => Err(Problem::new(
+                StatusCode::REQUEST_TIMEOUT,
+                "body-stalled",
+                format!("the body did not come within {} s", PATIENCE.as_secs()),
+            )),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! `/healthz`, `/readyz` and `/openapi.yaml`.
 
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::header;
 use axum::response::IntoResponse;
 
 use super::problem::Problem;
@@ -14,21 +14,14 @@ pub(super) async fn healthz() -> &'static str {
     "ok\n"
 }
 
-/// Says whether requests make sense now: the database can be read, and the service is not stopping. If stored files are damaged
-/// that could not be made again, it says how many; `cairn check` names them.
+/// Says whether requests make sense now: the database can be written, there is disk left, and the service is not stopping. If stored
+/// files are damaged that could not be made again, it says how many; `cairn check` names them.
 #[utoipa::path(get, path = "/readyz", tag = "service", responses(
     (status = 200, description = "It is ready", body = String, content_type = "text/plain"),
-    (status = 503, description = "It is stopping, or cannot read its data", body = Problem, content_type = "application/problem+json")))]
+    (status = 503, description = "It is stopping, or cannot write its data, or has too little disk left", body = Problem, content_type = "application/problem+json")))]
 pub(super) async fn readyz(State(api): State<Api>) -> Result<String, Problem> {
-    let not_ready = |detail| Problem::new(StatusCode::SERVICE_UNAVAILABLE, "not-ready", detail);
-    if api.stop.is_cancelled() {
-        return Err(not_ready("the service is stopping"));
-    }
-    let damage = api.store.damage().await.map_err(|error| {
-        tracing::error!(%error, "the database cannot be read");
-        not_ready("the service cannot read its data")
-    })?;
-    Ok(match damage.len() {
+    api.readiness.check(&api).await?;
+    Ok(match api.store.damage().await?.len() {
         0 => "ready\n".to_owned(),
         n => format!("ready, but {n} stored files are damaged; cairn check names them\n"),
     })

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use utoipa::ToSchema;
 
+use super::access::Caller;
 use super::download::none_match;
 use super::extract::{Body, Ids};
 use super::link::Link;
@@ -124,13 +125,14 @@ impl From<Job> for JobBody {
 pub(super) async fn create_job(
     State(api): State<Api>,
     Ids(project): Ids<ProjectId>,
+    caller: Caller,
     Body(new): Body<NewJob>,
 ) -> Result<impl IntoResponse, Problem> {
     let kind = new.kind.parse::<JobKind>().ok().filter(|k| k.on_request()).ok_or_else(|| {
         let words: Vec<_> = JobKind::ALL.iter().filter(|k| k.on_request()).map(|k| k.as_str()).collect();
         Problem::invalid("kind", format!("the kind must be one of {}", words.join(", ")))
     })?;
-    let job = api.store.create_job(project, kind).await?;
+    let job = api.store.create_job(project, kind, caller.key()).await?;
     let location = format!("/v1/jobs/{}", job.id);
     Ok((
         StatusCode::ACCEPTED,

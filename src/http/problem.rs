@@ -1,5 +1,7 @@
 //! Errors as RFC 9457 problem details.
 
+use std::num::NonZeroU16;
+
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
@@ -7,7 +9,7 @@ use utoipa::{IntoResponses, ToSchema};
 
 use crate::jobs::{ExportError, IntakeError};
 use crate::project::{Fault, JobState};
-use crate::storage::{StorageError, Trouble};
+use crate::storage::{Quota, StorageError, Trouble};
 
 /// What went wrong with a request, for people (`title`, `detail`) and for programs (`type`, `field`, `limit`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -28,6 +30,9 @@ pub struct Problem {
     /// The limit that was passed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub limit: Option<u64>,
+    /// Seconds after which the same request may go better: the header `retry-after`.
+    #[serde(skip)]
+    pub retry_after: Option<NonZeroU16>,
 }
 
 /// The answers that every resource may give.
@@ -61,6 +66,7 @@ impl Problem {
             detail: detail.into(),
             field: None,
             limit: None,
+            retry_after: None,
         }
     }
 
@@ -117,12 +123,21 @@ impl Problem {
     }
 }
 
+/// Travels with an answer for whoever counts: which kind of problem it is.
+#[derive(Debug, Clone)]
+pub(super) struct Reason(pub String);
+
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
         let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
         let mut response = (status, axum::Json(&self)).into_response();
         let problem = HeaderValue::from_static("application/problem+json");
         response.headers_mut().insert(header::CONTENT_TYPE, problem);
+        let word = self.kind.rsplit(':').next().unwrap_or("").to_owned();
+        response.extensions_mut().insert(Reason(word));
+        if let Some(seconds) = self.retry_after {
+            response.headers_mut().insert(header::RETRY_AFTER, seconds.get().into());
+        }
         if status == StatusCode::UNAUTHORIZED {
             response
                 .headers_mut()
@@ -144,6 +159,7 @@ impl From<StorageError> for Problem {
             | StorageError::NoDecision(_)
             | StorageError::NoUpload(_)
             | StorageError::NoKey(_)
+            | StorageError::NoWebhook(_)
             | StorageError::NoVersion(..) => Self::not_found(error.to_string()),
             StorageError::JobEnded(_) => Self::new(
                 StatusCode::CONFLICT,
@@ -154,6 +170,16 @@ impl From<StorageError> for Problem {
                     JobState::Running.as_str()
                 ),
             ),
+            StorageError::OverQuota { quota, limit, .. } => Self {
+                limit: Some(limit),
+                // Jobs end by themselves; room for scans comes when somebody deletes some or raises the limit.
+                retry_after: NonZeroU16::new(if quota == Quota::QueuedJobs { 10 } else { 3600 }),
+                ..Self::new(StatusCode::TOO_MANY_REQUESTS, "over-quota", error.to_string())
+            },
+            StorageError::TooManyWebhooks { limit, .. } => Self {
+                limit: Some(limit.into()),
+                ..Self::new(StatusCode::CONFLICT, "too-many-webhooks", error.to_string())
+            },
             StorageError::TooManyDecisions { limit, .. } => Self {
                 limit: Some(limit.into()),
                 ..Self::new(StatusCode::CONFLICT, "too-many-decisions", error.to_string())

@@ -5,14 +5,16 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::extract::Request;
-use axum::http::{HeaderName, HeaderValue, StatusCode};
-use axum::middleware::from_fn_with_state;
+use axum::http::{HeaderName, HeaderValue, StatusCode, header};
+use axum::middleware::{from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceBuilder;
+use tower::util::option_layer;
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::request_id::{MakeRequestId, PropagateRequestIdLayer, RequestId, SetRequestIdLayer};
+use tower_http::sensitive_headers::SetSensitiveRequestHeadersLayer;
 use tower_http::trace::TraceLayer;
 use ulid::Ulid;
 use utoipa::OpenApi;
@@ -21,9 +23,10 @@ use utoipa_axum::routes;
 
 use super::idempotency::{self, Running, idempotent};
 use super::{
-    Openness, Problem, access, cloud, decision, events, graph, health, job, model, page, pose, preview,
-    project, scan, tus, upload,
+    Access, Metrics, Problem, Readiness, access, cloud, decision, events, graph, health, job, metrics, model,
+    page, pose, preview, project, scan, shield, tus, upload, webhook,
 };
+use crate::jobs::webhooks::Targets;
 use crate::jobs::{Exports, Intake, Resumable};
 use crate::storage::Store;
 
@@ -38,8 +41,14 @@ pub struct Api {
     pub resumable: Resumable,
     /// Makes files for download.
     pub exports: Exports,
-    /// Whether requests without a key are served.
-    pub openness: Openness,
+    /// Who is let in.
+    pub access: Access,
+    /// Whom webhooks may reach.
+    pub webhooks: Arc<Targets>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
+    /// Whether requests make sense now.
+    pub readiness: Arc<Readiness>,
     /// Cancelled when the service begins to stop: long answers end then.
     pub stop: CancellationToken,
     /// The description of the interface, YAML.
@@ -62,6 +71,7 @@ pub struct Api {
         (name = "uploads", description = "Uploads that survive broken connections: tus 1.0 (https://tus.io)"),
         (name = "jobs", description = "Work in progress, in the words of OGC API Processes"),
         (name = "decisions", description = "What clients decide where the data alone cannot tell: identical rooms, symmetric halls"),
+        (name = "webhooks", description = "Addresses that are told when jobs end"),
         (name = "model", description = "Versions of a project's model, and what can be downloaded of them"),
         (name = "service", description = "The service itself"),
     )
@@ -81,6 +91,9 @@ fn routes() -> OpenApiRouter<Api> {
         .routes(routes!(events::follow_job))
         .routes(routes!(decision::create_decision, decision::list_decisions))
         .routes(routes!(decision::get_decision, decision::delete_decision))
+        .routes(routes!(webhook::create_webhook, webhook::list_webhooks))
+        .routes(routes!(webhook::get_webhook, webhook::delete_webhook))
+        .routes(routes!(webhook::list_deliveries))
         .routes(routes!(model::get_model))
         .routes(routes!(model::list_versions))
         .routes(routes!(model::get_version))
@@ -91,6 +104,7 @@ fn routes() -> OpenApiRouter<Api> {
         .routes(routes!(health::healthz))
         .routes(routes!(health::readyz))
         .routes(routes!(health::openapi))
+        .routes(routes!(metrics::metrics))
 }
 
 /// The description of the interface.
@@ -109,6 +123,8 @@ pub fn router(api: Api) -> Router {
     let id = HeaderName::from_static("x-request-id");
     let layers = ServiceBuilder::new()
         .layer(SetRequestIdLayer::new(id.clone(), NewRequestId))
+        // Whatever prints headers prints that there is a key, not which.
+        .layer(SetSensitiveRequestHeadersLayer::new([header::AUTHORIZATION]))
         .layer(TraceLayer::new_for_http().make_span_with(span))
         .layer(PropagateRequestIdLayer::new(id))
         .layer(CatchPanicLayer::custom(panicked));
@@ -125,7 +141,11 @@ pub fn router(api: Api) -> Router {
             )
         })
         .layer(from_fn_with_state((api.clone(), Running::default()), idempotent))
+        .layer(from_fn_with_state(api.clone(), access::shed))
         .layer(from_fn_with_state(api.clone(), access::guard))
+        .layer(from_fn_with_state(api.clone(), metrics::observe))
+        .layer(option_layer(shield::cors(&api.access.origins)))
+        .layer(from_fn(shield::harden))
         .with_state(api)
         .layer(layers)
 }

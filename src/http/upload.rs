@@ -8,6 +8,7 @@ use axum::response::IntoResponse;
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::access::Caller;
 use super::content_digest::content_digest;
 use super::download::Bytes;
 use super::extract::Ids;
@@ -52,6 +53,7 @@ pub(super) struct UploadBody {
 pub(super) async fn upload_scan(
     State(api): State<Api>,
     Ids(project): Ids<ProjectId>,
+    caller: Caller,
     mut query: Params,
     headers: HeaderMap,
     body: Body,
@@ -61,10 +63,12 @@ pub(super) async fn upload_scan(
         name: name(&mut query, None)?,
         interpretation: interpretation(&mut query)?,
         declared_bytes: declared(&headers),
+        sender: caller.key(),
         digests: content_digest(&headers)?,
     };
     query.finish()?;
     let admission = api.intake.receive(request, body.into_data_stream()).await?;
+    api.metrics.uploaded(admission.scan.bytes, admission.duplicate);
     let status = if admission.duplicate { StatusCode::OK } else { StatusCode::ACCEPTED };
     let location = format!("/v1/jobs/{}", admission.job.id);
     let body =

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use futures_util::{Stream, StreamExt};
 
 use crate::cloud::{Format, ScanKey, sniff};
-use crate::project::{Interpretation, Name, ProjectId};
+use crate::project::{Interpretation, KeyId, Name, ProjectId};
 use crate::storage::{Admission, NewScan, StorageError, Store, StoredBlob};
 
 use super::digest::{DigestCheck, DigestMismatch, ExpectedDigest};
@@ -26,6 +26,8 @@ pub struct UploadRequest {
     pub declared_bytes: Option<u64>,
     /// What they will hash to, if the client said so.
     pub digests: Vec<ExpectedDigest>,
+    /// The key that they come with.
+    pub sender: Option<KeyId>,
 }
 
 /// Why an upload is not taken in. Nothing of it is kept.
@@ -106,6 +108,8 @@ impl Intake {
             return Err(IntakeError::TooLarge { limit });
         }
         self.store.project(request.project).await?;
+        let declared = request.declared_bytes.unwrap_or(1);
+        self.store.check_upload(request.project, request.sender, declared).await?;
         let mut writer = self.store.blobs.writer();
         let mut head = Vec::new();
         let mut format = None;
@@ -138,7 +142,8 @@ impl Intake {
         let format = format.map_or_else(|| recognise(&head, &request.name), Ok)?;
         // Pinned until the end of this function: the row comes last.
         let stored = writer.finish().await?;
-        let new = scan_of(request.project, request.name, request.interpretation, format, *stored);
+        let new =
+            scan_of(request.project, request.name, request.interpretation, format, *stored, request.sender);
         Ok(self.store.admit_scan(&new).await?)
     }
 
@@ -160,9 +165,11 @@ pub(super) fn scan_of(
     interpretation: Interpretation,
     format: Format,
     stored: StoredBlob,
+    sender: Option<KeyId>,
 ) -> NewScan {
     let key = content_key(ScanKey::of_hash(&stored.id.0, &interpretation.to_bytes()));
-    NewScan { project, key, name, format: word(format), blob: stored.id, bytes: stored.bytes, interpretation }
+    let (format, blob, bytes) = (word(format), stored.id, stored.bytes);
+    NewScan { project, key, name, format, blob, bytes, interpretation, sender }
 }
 
 /// The format of a content, unless the name claims another one.

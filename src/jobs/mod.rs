@@ -31,6 +31,7 @@ mod resumable;
 mod resumable_tests;
 mod session;
 mod turnstile;
+pub mod webhooks;
 mod workers;
 
 pub use crate::cloud::metres_per_unit;

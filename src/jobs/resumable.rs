@@ -267,9 +267,9 @@ impl Resumable {
     }
 
     async fn admit(&self, upload: Upload, fresh: &FreshBlob, head: &[u8]) -> Result<Upload, ResumableError> {
-        let NewUpload { project, name, interpretation, length, .. } = &upload.announced;
+        let NewUpload { project, name, interpretation, length, sender, .. } = &upload.announced;
         let format = recognise(head, name)?;
-        let new = scan_of(*project, name.clone(), *interpretation, format, **fresh);
+        let new = scan_of(*project, name.clone(), *interpretation, format, **fresh, *sender);
         let expires = self.expiry();
         let admission = self.store.admit_upload(upload.id, &new, expires).await?;
         let end =

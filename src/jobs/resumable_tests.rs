@@ -49,6 +49,7 @@ impl Service {
             interpretation: Interpretation::default(),
             metadata: String::new(),
             length,
+            sender: None,
         };
         self.uploads.create(new).await.map(|upload| upload.id)
     }

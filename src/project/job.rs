@@ -147,6 +147,12 @@ impl Lane {
             Self::Map => "map",
         }
     }
+
+    /// The lane of this word.
+    #[must_use]
+    pub fn from_word(word: &str) -> Option<Self> {
+        [Self::Ingest, Self::Map].into_iter().find(|lane| lane.as_str() == word)
+    }
 }
 
 /// Why a job or a scan failed, in words for the client.

@@ -14,6 +14,7 @@ mod settings;
 mod time;
 mod token;
 mod upload;
+mod webhook;
 
 pub use decision::{BadMotion, Decision, KeptDecision, Verdict, motion};
 pub use id::{BadId, DecisionId, JobId, KeyId, ProjectId, ScanId, UploadId, VersionNumber, WebhookId};
@@ -27,3 +28,4 @@ pub use settings::{BadSettings, Project, ProjectSettings};
 pub use time::Timestamp;
 pub use token::{BadToken, Digest, Token};
 pub use upload::{NewUpload, Upload, UploadEnd};
+pub use webhook::{Delivery, DeliveryState, SigningSecret, Webhook};

@@ -1,6 +1,6 @@
 //! An upload that arrives in several requests, as plain data.
 
-use super::{Interpretation, JobId, Name, ProjectId, ScanId, Timestamp, UploadId};
+use super::{Interpretation, JobId, KeyId, Name, ProjectId, ScanId, Timestamp, UploadId};
 
 /// What a client announces before it sends the first byte.
 #[derive(Debug, Clone, PartialEq)]
@@ -15,6 +15,8 @@ pub struct NewUpload {
     pub metadata: String,
     /// How many bytes will come; at least one.
     pub length: u64,
+    /// The key that announced it: the scan will be on its account, whoever sends the rest.
+    pub sender: Option<KeyId>,
 }
 
 /// A scan that an upload became.

@@ -192,6 +192,7 @@ mod tests {
             blob: blob.id,
             bytes: blob.bytes,
             interpretation: Interpretation::default(),
+            sender: None,
         };
         store.admit_scan(&new).await.unwrap();
         blob.id

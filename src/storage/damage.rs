@@ -180,6 +180,7 @@ mod tests {
                 blob: blob.id,
                 bytes: blob.bytes,
                 interpretation: Interpretation::default(),
+                sender: None,
             };
             self.store.admit_scan(&new).await.unwrap();
             blob

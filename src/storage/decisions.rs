@@ -168,6 +168,7 @@ mod tests {
                 blob: BlobId(blake3::hash(&[content])),
                 bytes: 1,
                 interpretation: Interpretation::default(),
+                sender: None,
             };
             scans.push(store.admit_scan(&new).await.unwrap().scan.id);
         }

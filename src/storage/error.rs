@@ -3,7 +3,8 @@
 use std::io::ErrorKind;
 use std::path::PathBuf;
 
-use crate::project::{DecisionId, JobId, KeyId, ProjectId, ScanId, UploadId, VersionNumber};
+use super::{Holder, Quota};
+use crate::project::{DecisionId, JobId, KeyId, ProjectId, ScanId, UploadId, VersionNumber, WebhookId};
 
 /// A failure of the database or of the blob files.
 #[derive(Debug, thiserror::Error)]
@@ -33,9 +34,30 @@ pub enum StorageError {
         /// Bytes in its file.
         found: u64,
     },
+    /// No such webhook in the project.
+    #[error("there is no webhook {0}")]
+    NoWebhook(WebhookId),
+    /// The project holds as many webhooks as it may.
+    #[error("project {project} holds {limit} webhooks, which is the limit")]
+    TooManyWebhooks {
+        /// The project.
+        project: ProjectId,
+        /// How many it may hold.
+        limit: u32,
+    },
     /// No such key.
     #[error("there is no key {0}")]
     NoKey(KeyId),
+    /// A project or a key would have more than it may.
+    #[error("{} may have {limit} {}, and would have more", words(*holder), thing(*quota))]
+    OverQuota {
+        /// Whose limit it is.
+        holder: Holder,
+        /// What of.
+        quota: Quota,
+        /// How much it may have.
+        limit: u64,
+    },
     /// The project holds as many decisions as it may.
     #[error(
         "project {project} holds {limit} decisions, which is the limit; take back what no longer matters"
@@ -127,6 +149,20 @@ const SQLITE_LOCKED: i32 = 6;
 const SQLITE_IOERR: i32 = 10;
 const SQLITE_FULL: i32 = 13;
 const SQLITE_CANTOPEN: i32 = 14;
+fn words(holder: Holder) -> &'static str {
+    match holder {
+        Holder::Project(_) => "the project",
+        Holder::Key(_) => "the key",
+    }
+}
+
+fn thing(quota: Quota) -> &'static str {
+    match quota {
+        Quota::Bytes => "bytes of scans",
+        Quota::Scans => "scans",
+        Quota::QueuedJobs => "jobs that have not ended",
+    }
+}
 
 impl StorageError {
     /// Whether something was stored and cannot be read any more.

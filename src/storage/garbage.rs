@@ -130,6 +130,7 @@ mod tests {
                 blob: blob.id,
                 bytes: blob.bytes,
                 interpretation: Interpretation::default(),
+                sender: None,
             };
             self.store.admit_scan(&new).await.unwrap().scan
         }
@@ -204,7 +205,7 @@ mod tests {
         let f = Fixture::new().await;
         let project = f.project().await;
         for from in 0..2 {
-            f.store.create_job(project, JobKind::Rebuild).await.unwrap();
+            f.store.create_job(project, JobKind::Rebuild, None).await.unwrap();
             let claim = f.claim().await;
             let blobs = [["state 1", "content 1"], ["state 2", "content 2"]][from as usize];
             f.publish(&claim, from, Some((blobs[0], blobs[1]))).await;

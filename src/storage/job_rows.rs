@@ -3,9 +3,10 @@
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, Sqlite, Transaction};
 
+use super::quotas::Addition;
 use super::rows::{count, json, parsed, word};
 use super::{Page, StorageError, Store};
-use crate::project::{Job, JobId, JobKind, JobState, Lane, ProjectId, ScanId, Timestamp};
+use crate::project::{Job, JobId, JobKind, JobState, KeyId, Lane, ProjectId, ScanId, Timestamp};
 
 /// Which jobs to list.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -17,8 +18,13 @@ pub struct JobFilter {
 }
 
 impl Store {
-    /// Accepts a job on a project's model.
-    pub async fn create_job(&self, project: ProjectId, kind: JobKind) -> Result<Job, StorageError> {
+    /// Accepts a job on a project's model, asked for with a key.
+    pub async fn create_job(
+        &self,
+        project: ProjectId,
+        kind: JobKind,
+        key: Option<KeyId>,
+    ) -> Result<Job, StorageError> {
         let id = JobId::generate();
         let mut tx = self.begin().await?;
         let known = sqlx::query("SELECT 1 FROM projects WHERE id = ?")
@@ -28,7 +34,9 @@ impl Store {
         if known.is_none() {
             return Err(StorageError::NoProject(project));
         }
+        self.check_quotas(&mut tx, project, key, Addition { jobs: 1, ..Addition::default() }).await?;
         insert_job(&mut tx, id, project, None, kind, Lane::Map, Timestamp::now()).await?;
+        charge_job(&mut tx, id, key).await?;
         tx.commit().await?;
         self.announce([id]);
         self.ring();
@@ -123,6 +131,22 @@ pub(super) async fn insert_job(
     .bind(now.0)
     .execute(&mut **tx)
     .await?;
+    Ok(())
+}
+
+/// Notes on whose account a job is.
+pub(super) async fn charge_job(
+    tx: &mut Transaction<'static, Sqlite>,
+    id: JobId,
+    key: Option<KeyId>,
+) -> Result<(), StorageError> {
+    if let Some(key) = key {
+        sqlx::query("UPDATE jobs SET key_id = ? WHERE id = ?")
+            .bind(key.to_string())
+            .bind(id.to_string())
+            .execute(&mut **tx)
+            .await?;
+    }
     Ok(())
 }
 

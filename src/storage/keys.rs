@@ -172,10 +172,6 @@ async fn grant(
 }
 
 fn key(row: &SqliteRow) -> Result<Key, StorageError> {
-    let limit = |column| {
-        let some = row.try_get::<Option<i64>, _>(column)?.is_some();
-        if some { count(row, column).map(Some) } else { Ok(None) }
-    };
     let reach = if row.try_get("every_project")? {
         Reach::Everything
     } else {
@@ -190,14 +186,22 @@ fn key(row: &SqliteRow) -> Result<Key, StorageError> {
         name: word(row, "name", |text| Name::parse(text).ok())?,
         scope: word(row, "scope", Scope::from_word)?,
         reach,
-        limits: Limits {
-            bytes: limit("max_bytes")?,
-            scans: limit("max_scans")?,
-            queued_jobs: limit("max_queued_jobs")?,
-        },
+        limits: limits(row)?,
         created: Timestamp(row.try_get("created_ms")?),
         expires: row.try_get::<Option<i64>, _>("expires_ms")?.map(Timestamp),
         revoked: row.try_get::<Option<i64>, _>("revoked_ms")?.map(Timestamp),
+    })
+}
+
+pub(super) fn limits(row: &SqliteRow) -> Result<Limits, StorageError> {
+    let limit = |column| {
+        let some = row.try_get::<Option<i64>, _>(column)?.is_some();
+        if some { count(row, column).map(Some) } else { Ok(None) }
+    };
+    Ok(Limits {
+        bytes: limit("max_bytes")?,
+        scans: limit("max_scans")?,
+        queued_jobs: limit("max_queued_jobs")?,
     })
 }
 

@@ -38,6 +38,7 @@ impl Fixture {
             blob: BlobId(blake3::hash(&[content])),
             bytes: 1,
             interpretation: Interpretation::default(),
+            sender: None,
         };
         self.store.admit_scan(&new).await.unwrap()
     }
@@ -193,7 +194,7 @@ async fn a_removal_comes_before_the_same_content_again_and_a_rebuild_after_all()
     let removal = f.store.delete_scan(f.project, scan.scan.id).await.unwrap();
     let again = f.ingested(1).await;
     assert!(!again.duplicate, "the deleted scan does not count");
-    let rebuild = f.store.create_job(f.project, JobKind::Rebuild).await.unwrap();
+    let rebuild = f.store.create_job(f.project, JobKind::Rebuild, None).await.unwrap();
     let mut order = Vec::new();
     while let Some(claim) = f.claim(Lane::Map).await {
         order.push(claim.job.id);

@@ -3,11 +3,12 @@
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, Sqlite, Transaction};
 
-use super::job_rows::insert_job;
+use super::job_rows::{charge_job, insert_job};
+use super::quotas::Addition;
 use super::rows::{count, json, parsed, to_json, word};
 use super::{BlobId, Page, StorageError, Store};
 use crate::project::{
-    ContentKey, Interpretation, Job, JobId, JobKind, Lane, Name, ProjectId, Scan, ScanId, ScanState,
+    ContentKey, Interpretation, Job, JobId, JobKind, KeyId, Lane, Name, ProjectId, Scan, ScanId, ScanState,
     Standing, Timestamp, UploadEnd,
 };
 
@@ -28,6 +29,8 @@ pub struct NewScan {
     pub bytes: u64,
     /// How they are read.
     pub interpretation: Interpretation,
+    /// The key that sent them.
+    pub sender: Option<KeyId>,
 }
 
 /// What became of an upload.
@@ -46,7 +49,7 @@ impl Store {
     /// answered with the scan that it is; if that has failed or was dismissed, a new job tries again.
     pub async fn admit_scan(&self, new: &NewScan) -> Result<Admission, StorageError> {
         let mut tx = self.begin().await?;
-        let admitted = admit(&mut tx, new, Timestamp::now()).await?;
+        let admitted = self.admit(&mut tx, new, Timestamp::now()).await?;
         tx.commit().await?;
         self.admitted(new.project, admitted).await
     }
@@ -63,6 +66,47 @@ impl Store {
         }
         let (scan, job) = (self.scan(project, scan).await?, self.job(job).await?);
         Ok(Admission { scan, job, duplicate })
+    }
+
+    /// Admits a scan within a transaction.
+    pub(super) async fn admit(
+        &self,
+        tx: &mut Transaction<'static, Sqlite>,
+        new: &NewScan,
+        now: Timestamp,
+    ) -> Result<UploadEnd, StorageError> {
+        let known = sqlx::query(
+            "SELECT id, job_id, state FROM scans WHERE project_id = ? AND content_key = ? AND deleted_ms IS NULL",
+        )
+        .bind(new.project.to_string())
+        .bind(new.key.0.to_be_bytes().as_slice())
+        .fetch_optional(&mut **tx)
+        .await?;
+        let Some(row) = known else {
+            self.check_quotas(
+                &mut *tx,
+                new.project,
+                new.sender,
+                Addition { bytes: new.bytes, scans: 1, jobs: 1 },
+            )
+            .await?;
+            let (scan, job) = insert_scan(tx, new, now).await?;
+            return Ok(UploadEnd { scan, job, duplicate: false });
+        };
+        let scan = parsed(&row, "id")?;
+        match word(&row, "state", ScanState::from_word)? {
+            ScanState::Failed | ScanState::Dismissed => {
+                self.check_quotas(
+                    &mut *tx,
+                    new.project,
+                    new.sender,
+                    Addition { jobs: 1, ..Addition::default() },
+                )
+                .await?;
+                Ok(UploadEnd { scan, job: try_again(tx, new, scan, now).await?, duplicate: false })
+            }
+            _ => Ok(UploadEnd { scan, job: parsed(&row, "job_id")?, duplicate: true }),
+        }
     }
 
     /// One scan that was not deleted.
@@ -159,32 +203,6 @@ impl Store {
     }
 }
 
-/// Admits a scan within a transaction.
-pub(super) async fn admit(
-    tx: &mut Transaction<'static, Sqlite>,
-    new: &NewScan,
-    now: Timestamp,
-) -> Result<UploadEnd, StorageError> {
-    let known = sqlx::query(
-        "SELECT id, job_id, state FROM scans WHERE project_id = ? AND content_key = ? AND deleted_ms IS NULL",
-    )
-    .bind(new.project.to_string())
-    .bind(new.key.0.to_be_bytes().as_slice())
-    .fetch_optional(&mut **tx)
-    .await?;
-    let Some(row) = known else {
-        let (scan, job) = insert_scan(tx, new, now).await?;
-        return Ok(UploadEnd { scan, job, duplicate: false });
-    };
-    let scan = parsed(&row, "id")?;
-    match word(&row, "state", ScanState::from_word)? {
-        ScanState::Failed | ScanState::Dismissed => {
-            Ok(UploadEnd { scan, job: try_again(tx, new, scan, now).await?, duplicate: false })
-        }
-        _ => Ok(UploadEnd { scan, job: parsed(&row, "job_id")?, duplicate: true }),
-    }
-}
-
 /// A new scan and the job that registers it.
 async fn insert_scan(
     tx: &mut Transaction<'static, Sqlite>,
@@ -202,7 +220,7 @@ async fn insert_scan(
     let (scan, job) = (ScanId::generate(), JobId::generate());
     sqlx::query(
         "INSERT INTO scans (id, project_id, content_key, name, format, blob, bytes, interpretation, arrival, state,
-           job_id, created_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, 'received', ?, ?)",
+           job_id, created_ms, key_id) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, 'received', ?, ?, ?)",
     )
     .bind(scan.to_string())
     .bind(new.project.to_string())
@@ -215,9 +233,11 @@ async fn insert_scan(
     .bind(arrival)
     .bind(job.to_string())
     .bind(now.0)
+    .bind(new.sender.map(|key| key.to_string()))
     .execute(&mut **tx)
     .await?;
     insert_job(tx, job, new.project, Some(scan), JobKind::Registration, Lane::Ingest, now).await?;
+    charge_job(tx, job, new.sender).await?;
     Ok((scan, job))
 }
 
@@ -236,6 +256,7 @@ async fn try_again(
         .execute(&mut **tx)
         .await?;
     insert_job(tx, job, new.project, Some(scan), JobKind::Registration, Lane::Ingest, now).await?;
+    charge_job(tx, job, new.sender).await?;
     Ok(job)
 }
 

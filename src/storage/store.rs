@@ -2,7 +2,7 @@
 
 use std::fs::{File, TryLockError};
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use sqlx::migrate::Migrator;
@@ -13,7 +13,7 @@ use sqlx::{Row, Sqlite, Transaction};
 use tokio::sync::{Notify, broadcast};
 
 use super::{BlobStore, Hold, StorageError, UploadFiles};
-use crate::project::JobId;
+use crate::project::{JobId, Limits};
 
 /// How long a statement waits for a lock that another process holds, such as a backup.
 pub(super) const BUSY: Duration = Duration::from_secs(5);
@@ -48,6 +48,7 @@ pub struct Store {
 
 #[derive(Debug)]
 struct Bells {
+    project_limits: OnceLock<Limits>,
     changed: broadcast::Sender<JobId>,
     work: Notify,
     _claim: DataClaim,
@@ -131,7 +132,12 @@ impl Store {
     ) -> Result<Self, StorageError> {
         let read =
             SqlitePoolOptions::new().max_connections(READERS).connect_with(options.read_only(true)).await?;
-        let bells = Bells { changed: broadcast::Sender::new(CHANGES), work: Notify::new(), _claim: claim };
+        let bells = Bells {
+            project_limits: OnceLock::new(),
+            changed: broadcast::Sender::new(CHANGES),
+            work: Notify::new(),
+            _claim: claim,
+        };
         let uploads = UploadFiles::at_folder(&data.join("uploads"));
         Ok(Self { data: data.into(), read, write, blobs, uploads, bells: Arc::new(bells) })
     }
@@ -153,6 +159,15 @@ impl Store {
             }
             other => Ok(other?),
         }
+    }
+
+    /// Sets how much each project may have, once; without that there is no limit.
+    pub fn limit_projects(&self, limits: Limits) {
+        self.bells.project_limits.get_or_init(|| limits);
+    }
+
+    pub(super) fn project_limits(&self) -> Limits {
+        self.bells.project_limits.get().copied().unwrap_or_default()
     }
 
     /// Hears of every job that changes, after the change is committed.

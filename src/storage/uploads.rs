@@ -6,10 +6,9 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::rows::{count, json, parsed, to_json, word};
-use super::scans::admit;
 use super::upload_files::blocking;
 use super::{Admission, FreshBlob, NewScan, StorageError, Store, StoredBlob};
-use crate::project::{Name, NewUpload, ProjectId, ScanId, Timestamp, Upload, UploadEnd, UploadId};
+use crate::project::{KeyId, Name, NewUpload, ProjectId, ScanId, Timestamp, Upload, UploadEnd, UploadId};
 
 /// How long after its expiry an upload is remembered, so that its client is told what happened to it.
 const REMEMBERED: Duration = Duration::from_hours(24);
@@ -23,9 +22,10 @@ impl Store {
         if known.fetch_optional(&mut *tx).await?.is_none() {
             return Err(StorageError::NoProject(new.project));
         }
+        self.check_announcement(&mut tx, new.project, new.sender, new.length).await?;
         sqlx::query(
-            "INSERT INTO uploads (id, project_id, name, interpretation, metadata, length, created_ms, expires_ms)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO uploads (id, project_id, name, interpretation, metadata, length, created_ms, expires_ms, key_id)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
         )
         .bind(id.to_string())
         .bind(new.project.to_string())
@@ -35,6 +35,7 @@ impl Store {
         .bind(new.length.cast_signed())
         .bind(created.0)
         .bind(expires.0)
+        .bind(new.sender.map(|key| key.to_string()))
         .execute(&mut *tx)
         .await?;
         tx.commit().await?;
@@ -103,7 +104,7 @@ impl Store {
         expires: Timestamp,
     ) -> Result<Admission, StorageError> {
         let mut tx = self.begin().await?;
-        let admitted = admit(&mut tx, new, Timestamp::now()).await?;
+        let admitted = self.admit(&mut tx, new, Timestamp::now()).await?;
         let done = sqlx::query(
             "UPDATE uploads SET received = length, scan_id = ?, job_id = ?, duplicate = ?, expires_ms = ?
              WHERE id = ? AND scan_id IS NULL",
@@ -178,6 +179,10 @@ fn upload(row: &SqliteRow) -> Result<Upload, StorageError> {
             interpretation: json(row, "interpretation")?.unwrap_or_default(),
             metadata: row.try_get("metadata")?,
             length: count(row, "length")?,
+            sender: match row.try_get::<Option<String>, _>("key_id")? {
+                Some(_) => Some(parsed::<KeyId>(row, "key_id")?),
+                None => None,
+            },
         },
         received: count(row, "received")?,
         blob: row.try_get("blob")?,
@@ -205,6 +210,7 @@ mod tests {
             interpretation: Interpretation::default(),
             metadata: String::new(),
             length: 10,
+            sender: None,
         };
         let now = Timestamp::now();
         let (soon, late) = (now.plus(Duration::from_secs(1)), now.plus(Duration::from_hours(1)));

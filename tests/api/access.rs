@@ -108,7 +108,7 @@ impl Place {
 }
 
 /// Announces an upload into a project.
-async fn announce(server: &Server, project: &str, token: Option<&str>) -> Response {
+pub async fn announce(server: &Server, project: &str, token: Option<&str>) -> Response {
     let encoded = |text: &str| STANDARD.encode(text);
     let metadata = format!("project {},name {}", encoded(project), encoded("b.ply"));
     let request = server

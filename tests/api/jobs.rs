@@ -78,8 +78,12 @@ async fn events_tell_the_job_until_its_end_and_resume_by_id() {
         .collect();
     assert!(progress.is_sorted() && progress.last() == Some(&100), "{progress:?}");
     let last = ids.last().unwrap();
-    let after = server.client.get(server.url(&path)).header("last-event-id", last.to_string()).send();
-    assert_eq!(after.await.unwrap().text().await.unwrap(), "");
+    let after = |id: u64| server.client.get(server.url(&path)).header("last-event-id", id.to_string()).send();
+    assert_eq!(after(*last).await.unwrap().status(), 204, "nothing is left to hear, so do not come again");
+    let missed = after(last - 1).await.unwrap().text().await.unwrap();
+    assert!(missed.contains(&format!("id: {last}")) && missed.contains("event: succeeded"), "{missed}");
+    let foreign = after(last + 1000).await.unwrap().text().await.unwrap();
+    assert!(foreign.contains("event: succeeded"), "an id that is not of this job hides nothing: {foreign}");
     server.stop().await;
 }
 

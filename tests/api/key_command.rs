@@ -58,7 +58,7 @@ async fn nothing_secret_is_in_the_log_however_much_is_logged() {
     let dir = tempfile::tempdir().unwrap();
     let token = told(dir.path(), &["create", "rig", "--scope", "manage", "--all-projects"]).trim().to_owned();
     let mut serve = cairn(dir.path())
-        .args(["serve", "--listen", "127.0.0.1:0", "--log-json"])
+        .args(["serve", "--listen", "127.0.0.1:0", "--log-json", "--webhook-hosts", "hooks.example.com"])
         .env("RUST_LOG", "trace")
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -79,7 +79,14 @@ async fn nothing_secret_is_in_the_log_however_much_is_logged() {
         assert_eq!(client.get(&url).bearer_auth(shown).send().await.unwrap().status(), status);
     }
     let body = serde_json::json!({ "name": "p" });
-    assert_eq!(client.post(&url).bearer_auth(&token).json(&body).send().await.unwrap().status(), 201);
+    let made = client.post(&url).bearer_auth(&token).json(&body).send().await.unwrap();
+    assert_eq!(made.status(), 201);
+    let hooks = format!("{url}/{}/webhooks", made.json::<Value>().await.unwrap()["id"].as_str().unwrap());
+    let body = serde_json::json!({ "url": "https://hooks.example.com/?receiver=private" });
+    let hook = client.post(&hooks).bearer_auth(&token).json(&body).send().await.unwrap();
+    assert_eq!(hook.status(), 201);
+    let hook: Value = hook.json().await.unwrap();
+    let signing = hook["secret"].as_str().unwrap().trim_start_matches("whsec_").to_owned();
     serve.kill().unwrap();
     serve.wait().unwrap();
     let log = log.join().unwrap().unwrap();
@@ -88,4 +95,8 @@ async fn nothing_secret_is_in_the_log_however_much_is_logged() {
     for part in [&token[token.len() - 64..token.len() - 32], &token[token.len() - 40..token.len() - 8]] {
         assert!(!log.contains(part), "a part of a key is in the log");
     }
+    assert!(
+        !log.contains(&signing) && !log.contains("receiver=private"),
+        "what webhooks keep secret is in the log"
+    );
 }

@@ -71,9 +71,7 @@ const LOCK: &str = "cairn.lock";
 /// # Errors
 /// Where the service does not start, a call fails, or files cannot be read or written.
 pub fn run(args: &DemoArgs) -> anyhow::Result<ExitCode> {
-    if std::env::var_os("RUST_LOG").is_some() {
-        telemetry::init(false)?;
-    }
+    let _telemetry = std::env::var_os("RUST_LOG").map(|_| telemetry::init(false)).transpose()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
         let started = Instant::now();

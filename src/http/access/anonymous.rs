@@ -4,7 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 
 use axum::http::request::Parts;
 use axum::http::uri::Authority;
-use axum::http::{HeaderName, StatusCode, header};
+use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 
 use crate::http::Problem;
 use crate::storage::{Keys, StorageError};
@@ -42,7 +42,7 @@ impl Openness {
 
     /// Refuses what a stranger's web page may have a browser on this machine send. The connection comes from here either way,
     /// but the browser says for which host and from which page.
-    pub(super) fn check_browser(self, parts: &Parts) -> Result<(), Problem> {
+    pub(super) fn check_browser(self, parts: &Parts, origins: &[HeaderValue]) -> Result<(), Problem> {
         let refuse = |detail| Err(Problem::new(StatusCode::FORBIDDEN, "not-allowed", detail));
         if self != Self::ThisMachine {
             return Ok(());
@@ -53,7 +53,8 @@ impl Openness {
         if !host.is_none_or(names_this_machine) {
             return refuse("without a key, the service has to be addressed as localhost or by a number");
         }
-        let foreign = text(header::ORIGIN).is_some_and(|origin| {
+        let foreign = text(header::ORIGIN).filter(|origin| !origins.iter().any(|allowed| allowed == origin));
+        let foreign = foreign.is_some_and(|origin| {
             origin.split_once("://").is_none_or(|(_, authority)| Some(authority) != host)
         });
         if foreign { refuse("without a key, pages of other sites may not send requests") } else { Ok(()) }
@@ -79,7 +80,10 @@ mod tests {
         if let Some(origin) = origin {
             request = request.header(header::ORIGIN, origin);
         }
-        Openness::ThisMachine.check_browser(&request.body(()).unwrap().into_parts().0)
+        Openness::ThisMachine.check_browser(
+            &request.body(()).unwrap().into_parts().0,
+            &[HeaderValue::from_static("https://viewer.example")],
+        )
     }
 
     #[test]
@@ -95,6 +99,7 @@ mod tests {
         for host in ["localhost", "localhost:8080", "127.0.0.1:8080", "[::1]:8080"] {
             assert!(checked(host, None).is_ok(), "{host}");
             assert!(checked(host, Some(&format!("http://{host}"))).is_ok(), "{host}");
+            assert!(checked(host, Some("https://viewer.example")).is_ok(), "{host}");
             for origin in ["https://evil.example", "null", "http://127.0.0.1:1"] {
                 assert!(checked(host, Some(origin)).is_err(), "{host} from {origin}");
             }

@@ -60,6 +60,14 @@ impl Caller {
         }
     }
 
+    /// The key on whose account the request is.
+    pub fn key(&self) -> Option<KeyId> {
+        match self {
+            Self::Anyone => None,
+            Self::Holder(key) => Some(key.id),
+        }
+    }
+
     /// The key, if the caller reaches only the projects that were granted to it one by one.
     pub fn granted(&self) -> Option<KeyId> {
         match self {

@@ -6,12 +6,28 @@ use utoipa::openapi::path::Operation;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
 use utoipa::openapi::{ContentBuilder, OpenApi, PathItem, Ref, Response, ResponseBuilder};
 
+use super::load::brings_work;
 use super::rules::Rule;
 
 /// Status, name and meaning of the refusals that every route with a rule may answer with.
 const REFUSALS: [(&str, &str, &str); 2] = [
     ("401", "NoKey", "No key, or one that opens nothing (any more); `www-authenticate` is `Bearer`"),
     ("403", "NotAllowed", "The key may not do this"),
+];
+
+/// The same of those that bring work.
+const OVERLOAD: [(&str, &str, &str); 3] = [
+    ("408", "Stalled", "The body did not come in time"),
+    (
+        "429",
+        "OverQuota",
+        "The project or the key has as much as it may; `retry-after` says when to ask again",
+    ),
+    (
+        "503",
+        "Overloaded",
+        "No more work is taken on, or the service is stopping; `retry-after` says when to ask again",
+    ),
 ];
 
 /// Writes into each operation which scope it needs (`x-cairn-scope`) and how it refuses.
@@ -23,7 +39,7 @@ pub(in crate::http) fn describe(mut api: OpenApi) -> OpenApi {
         .build();
     let components = api.components.get_or_insert_default();
     components.security_schemes.insert("key".to_owned(), SecurityScheme::Http(scheme).into());
-    for (_, name, meaning) in REFUSALS {
+    for (_, name, meaning) in REFUSALS.into_iter().chain(OVERLOAD) {
         components.responses.insert(name.to_owned(), problem(meaning).into());
     }
     for (template, item) in &mut api.paths.paths {
@@ -35,9 +51,15 @@ pub(in crate::http) fn describe(mut api: OpenApi) -> OpenApi {
                     operation.security = Some(vec![key, SecurityRequirement::default()]);
                     let scope = ExtensionsBuilder::new().add("x-cairn-scope", scope.as_str()).build();
                     operation.extensions.get_or_insert_default().merge(scope);
-                    let refusals = REFUSALS
-                        .map(|(status, name, _)| (status.to_owned(), Ref::from_response_name(name).into()));
-                    operation.responses.responses.extend(refusals);
+                    let also = if brings_work(&method) { OVERLOAD.as_slice() } else { &[] };
+                    for (status, name, meaning) in REFUSALS.iter().chain(also) {
+                        // An answer to HEAD has no body.
+                        let refusal = match method {
+                            Method::HEAD => Response::new(*meaning).into(),
+                            _ => Ref::from_response_name(*name).into(),
+                        };
+                        operation.responses.responses.entry((*status).to_owned()).or_insert(refusal);
+                    }
                 }
             }
         }

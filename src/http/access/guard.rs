@@ -59,14 +59,14 @@ async fn caller(api: &Api, parts: &mut Parts) -> Result<Option<Caller>, Problem>
 async fn identify(api: &Api, parts: &Parts) -> Result<Caller, Problem> {
     let keys = api.store.keys();
     let Some(shown) = shown(&parts.headers)? else {
-        if !api.openness.admits(&keys).await? {
+        if !api.access.openness.admits(&keys).await? {
             return Err(Problem::new(
                 StatusCode::UNAUTHORIZED,
                 "no-key",
                 "this needs a key, sent as `Authorization: Bearer cairn_…`",
             ));
         }
-        api.openness.check_browser(parts)?;
+        api.access.openness.check_browser(parts, &api.access.origins)?;
         return Ok(Caller::Anyone);
     };
     let key = keys.opened_by(&shown).await?.ok_or_else(bad_key)?;

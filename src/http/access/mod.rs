@@ -9,9 +9,27 @@ mod anonymous;
 mod caller;
 mod description;
 mod guard;
+mod load;
 mod rules;
+
+use std::sync::Arc;
+
+use axum::http::HeaderValue;
 
 pub use anonymous::Openness;
 pub(super) use caller::Caller;
 pub(super) use description::describe;
 pub(super) use guard::guard;
+pub use load::LoadLimits;
+pub(super) use load::{has_space, shed};
+
+/// Who is let in, and when nobody is.
+#[derive(Debug, Clone)]
+pub struct Access {
+    /// Whether requests without a key are served.
+    pub openness: Openness,
+    /// Origins of other sites whose pages may use the API.
+    pub origins: Arc<[HeaderValue]>,
+    /// When no more work is taken on.
+    pub load: LoadLimits,
+}

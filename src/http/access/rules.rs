@@ -43,6 +43,10 @@ impl Rule {
             "/v1/uploads/{upload}" if *method != Method::GET => {
                 return Self::Key(Scope::Upload, Subject::Upload);
             }
+            // Addresses of webhooks may hold secrets of their receivers.
+            _ if template.starts_with("/v1/projects/{project}/webhooks") => {
+                return Self::Key(Scope::Manage, Subject::Project);
+            }
             "/v1/projects" if looks => return Self::Key(Scope::Read, Subject::Own),
             "/v1/projects/{project}/scans" if *method == Method::POST => {
                 return Self::Key(Scope::Upload, Subject::Project);

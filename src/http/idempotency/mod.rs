@@ -2,7 +2,7 @@
 //!
 //! The layer hashes the request while the handler reads it, and keeps the answer under the key for a day. A key that
 //! comes with another request is refused (422), one whose first request still runs as well (409). Not kept are failures
-//! of the service and answers that were given before the whole request was read: then trying again is right. Uses
+//! of the service, refusals for want of room, and answers that were given before the whole request was read: then trying again is right. Uses
 //! [`crate::storage::KeptAnswer`].
 
 mod description;
@@ -96,7 +96,7 @@ async fn once(
     let (body, hash) = Hashing::new(hasher, body);
     let answer = next.run(Request::from_parts(parts, Body::new(body))).await;
     let Some(request) = hash.whole() else { return Ok(answer) };
-    if answer.status().is_server_error() {
+    if answer.status().is_server_error() || answer.status() == StatusCode::TOO_MANY_REQUESTS {
         return Ok(answer);
     }
     keep(api, scope, key, request, answer).await

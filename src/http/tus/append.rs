@@ -1,5 +1,7 @@
 //! `PATCH /v1/uploads/{u}`: an upload goes on.
 
+use std::sync::Arc;
+
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode};
@@ -11,9 +13,10 @@ use super::headers::{brings_bytes, bytes, continuation, standing};
 use super::version::Tus;
 use crate::http::download::Bytes;
 use crate::http::extract::Ids;
+use crate::http::metrics::Metrics;
 use crate::http::problem::{Problem, Problems};
 use crate::http::router::Api;
-use crate::project::UploadId;
+use crate::project::{Upload, UploadId};
 
 /// Continues an upload. What came before a broken connection is kept, unless a checksum was given: then all bytes of the
 /// request are kept or none. The answer to the last byte names the scan; it comes when that is acknowledged like a direct
@@ -56,10 +59,19 @@ pub(super) async fn continue_upload(
     let offset = bytes(&headers, "upload-offset")?
         .ok_or_else(|| Problem::invalid("upload-offset", "`upload-offset` is missing"))?;
     let request = continuation(&headers, offset)?;
+    let metrics = Arc::clone(&api.metrics);
     let upload =
         detached(async move { Ok(api.resumable.append(id, request, body.into_data_stream()).await?) })
             .await?;
+    count(&metrics, &upload);
     Ok((StatusCode::NO_CONTENT, standing(&upload)?).into_response())
+}
+
+/// Counts an upload that has become a scan.
+pub(super) fn count(metrics: &Metrics, upload: &Upload) {
+    if let Some(end) = upload.end {
+        metrics.uploaded(upload.announced.length, end.duplicate);
+    }
 }
 
 /// Runs to its end even if the connection breaks and nobody waits for the answer: what came is to be made safe.

@@ -5,7 +5,7 @@ use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
-use super::append::detached;
+use super::append::{count, detached};
 use super::headers::{BYTES, brings_bytes, bytes, continuation, standing, text};
 use super::metadata::parse_metadata;
 use super::version::Tus;
@@ -67,9 +67,11 @@ pub(super) async fn create_upload(
             interpretation: parsed.interpretation,
             metadata: metadata.to_owned(),
             length,
+            sender: caller.key(),
         })
         .await?;
     let upload = if with_bytes { first_bytes(&api, upload, request, body).await? } else { upload };
+    count(&api.metrics, &upload);
     let location = [(header::LOCATION, format!("/v1/uploads/{}", upload.id))];
     Ok((StatusCode::CREATED, location, standing(&upload)?).into_response())
 }
