@@ -33,6 +33,6 @@ pub(super) fn spans() -> Result<Option<(SpanLayer, Spans)>, ExporterBuildError> 
         .with_batch_exporter(exporter)
         .with_resource(Resource::builder().with_service_name("cairn").build())
         .build();
-    let layer = tracing_opentelemetry::layer().with_tracer(provider.tracer("cairn")).boxed();
+    let layer = tracing_opentelemetry::layer::<Registry>().with_tracer(provider.tracer("cairn")).boxed();
     Ok(Some((layer, Spans(provider))))
 }
