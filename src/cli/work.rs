@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::Args;
 use rustix::process::{Resource, Rlimit, setrlimit};
+use tokio::signal::unix::{SignalKind, signal};
 
 use crate::config::Settings;
 use crate::jobs::{Compute, NOT_NOW, work_alone, yield_to_clients};
@@ -64,6 +65,8 @@ pub fn run(args: &WorkArgs) -> anyhow::Result<ExitCode> {
     let compute = Compute::new(args.threads)?;
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let worked = runtime.block_on(async {
+        // A signal to the service and its processes, as at a shutdown, is the service's business: dying of it would look like a crash.
+        let _ignored = [SignalKind::terminate(), SignalKind::interrupt()].map(signal);
         let store = Store::open_for_service(&args.data).await?;
         work_alone(store, compute, config.workers, args.job, args.attempt).await
     });

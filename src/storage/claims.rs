@@ -49,40 +49,43 @@ pub struct Measures {
     pub scale: f64,
 }
 
+/// Arrival of the eighth scan of a job's project that takes part, NULL if there are fewer.
+const EIGHTH: &str =
+    "(SELECT e.arrival FROM scans e WHERE e.project_id = j.project_id AND e.deleted_ms IS NULL
+    AND e.state NOT IN ('failed', 'dismissed') ORDER BY e.arrival LIMIT 1 OFFSET 7)";
+
 /// Jobs `j` (with their scans `s`) of a project that nobody maps now which may be mapped. A registration waits for removals before
 /// it, and, from the ninth scan on, until the first eight are decoded, because these decide the resolution. What works on the
 /// whole model waits for everything that was accepted before it.
-const MAY_BE_MAPPED: &str = "
-    j.lane = 'map' AND j.state IN ('accepted', 'running') AND j.worker IS NULL AND j.leader IS NULL
-      AND j.not_before_ms <= ?1
-      AND CASE j.kind
-        WHEN 'removal' THEN 1
-        WHEN 'registration' THEN
-          NOT EXISTS (SELECT 1 FROM jobs r WHERE r.project_id = j.project_id AND r.kind = 'removal'
-                      AND r.state IN ('accepted', 'running') AND r.seq < j.seq)
-          AND NOT EXISTS (SELECT 1 FROM jobs i JOIN scans f ON f.id = i.scan_id
-                      WHERE i.project_id = j.project_id AND i.lane = 'ingest' AND i.state IN ('accepted', 'running')
-                      AND f.arrival < s.arrival
-                      AND 8 > (SELECT COUNT(*) FROM scans e WHERE e.project_id = j.project_id
-                               AND e.arrival < f.arrival AND e.deleted_ms IS NULL
-                               AND e.state NOT IN ('failed', 'dismissed'))
-                      AND 8 <= (SELECT COUNT(*) FROM scans e WHERE e.project_id = j.project_id
-                               AND e.arrival < s.arrival AND e.deleted_ms IS NULL
-                               AND e.state NOT IN ('failed', 'dismissed')))
-        ELSE NOT EXISTS (SELECT 1 FROM jobs e WHERE e.project_id = j.project_id
-                         AND e.state IN ('accepted', 'running') AND e.seq < j.seq)
-      END";
+fn may_be_mapped() -> String {
+    format!(
+        "j.lane = 'map' AND j.state IN ('accepted', 'running') AND j.worker IS NULL AND j.leader IS NULL
+           AND j.not_before_ms <= ?1
+           AND CASE j.kind
+             WHEN 'removal' THEN 1
+             WHEN 'registration' THEN
+               NOT EXISTS (SELECT 1 FROM jobs r WHERE r.project_id = j.project_id AND r.kind = 'removal'
+                           AND r.state IN ('accepted', 'running') AND r.lane = 'map' AND r.seq < j.seq)
+               AND (s.arrival <= COALESCE({EIGHTH}, s.arrival)
+                    OR NOT EXISTS (SELECT 1 FROM scans f JOIN jobs i ON i.id = f.job_id
+                                   WHERE f.project_id = j.project_id AND f.arrival <= {EIGHTH}
+                                     AND i.lane = 'ingest' AND i.state IN ('accepted', 'running')))
+             ELSE NOT EXISTS (SELECT 1 FROM jobs e WHERE e.project_id = j.project_id
+                              AND e.state IN ('accepted', 'running') AND e.lane IN ('ingest', 'map') AND e.seq < j.seq)
+           END"
+    )
+}
 
 /// The job to be mapped next: mapping is serial in a project, and projects take turns, so that a thousand scans of one do not keep
 /// another's single scan waiting. In a project the oldest comes first.
 fn next_to_map() -> String {
+    let may_be_mapped = may_be_mapped();
     format!(
         "SELECT seq FROM (
            SELECT p.map_turn AS turn, (SELECT j.seq FROM jobs j LEFT JOIN scans s ON s.id = j.scan_id
-                                       WHERE j.project_id = p.id AND {MAY_BE_MAPPED} ORDER BY j.seq LIMIT 1) AS seq
+                                       WHERE j.project_id = p.id AND {may_be_mapped} ORDER BY j.seq LIMIT 1) AS seq
            FROM projects p
-           WHERE p.id IN (SELECT o.project_id FROM jobs o WHERE o.lane = 'map' AND o.state IN ('accepted', 'running'))
-             AND NOT EXISTS (SELECT 1 FROM jobs h WHERE h.project_id = p.id AND h.lane = 'map' AND h.worker IS NOT NULL))
+           WHERE NOT EXISTS (SELECT 1 FROM jobs h WHERE h.project_id = p.id AND h.lane = 'map' AND h.worker IS NOT NULL))
          WHERE seq IS NOT NULL ORDER BY turn, seq LIMIT 1"
     )
 }
@@ -93,10 +96,8 @@ const NEXT_TO_INGEST: &str = "
       SELECT p.ingest_turn AS turn,
         (SELECT j.seq FROM jobs j WHERE j.project_id = p.id AND j.lane = 'ingest' AND j.state IN ('accepted', 'running')
            AND j.worker IS NULL AND j.not_before_ms <= ?1 ORDER BY j.seq LIMIT 1) AS seq,
-        (SELECT COUNT(*) FROM jobs w WHERE w.project_id = p.id AND w.lane = 'ingest' AND w.state IN ('accepted', 'running')
-           AND w.worker IS NOT NULL) AS workers
-      FROM projects p
-      WHERE p.id IN (SELECT o.project_id FROM jobs o WHERE o.lane = 'ingest' AND o.state IN ('accepted', 'running')))
+        (SELECT COUNT(*) FROM jobs w WHERE w.project_id = p.id AND w.lane = 'ingest' AND w.worker IS NOT NULL) AS workers
+      FROM projects p)
     WHERE seq IS NOT NULL ORDER BY workers, turn, seq LIMIT 1";
 
 impl Store {
@@ -302,11 +303,12 @@ async fn join_batch(
     now: Timestamp,
     limit: u32,
 ) -> Result<Vec<Job>, StorageError> {
+    let may_be_mapped = may_be_mapped();
     let rows = sqlx::query(sqlx::AssertSqlSafe(format!(
         "UPDATE jobs SET state = 'running', leader = ?2, attempt = attempt + 1,
            started_ms = COALESCE(started_ms, ?1), updated_ms = ?1, revision = revision + 1
          WHERE seq IN (SELECT j.seq FROM jobs j JOIN scans s ON s.id = j.scan_id
-                       WHERE j.project_id = ?3 AND j.kind = 'registration' AND {MAY_BE_MAPPED}
+                       WHERE j.project_id = ?3 AND j.kind = 'registration' AND {may_be_mapped}
                          AND j.tries = 0 AND j.crashes = 0 AND (j.losses > 0) = ?5 ORDER BY j.seq LIMIT ?4) RETURNING *"
     )))
     .bind(now.0)

@@ -112,3 +112,18 @@ fn version(row: &SqliteRow) -> Result<Version, StorageError> {
         created: Timestamp(row.try_get("created_ms")?),
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_packed_is_read_back_and_so_is_what_the_first_programs_wrote() {
+        let content = ModelContent { resolution: 0.25, ..ModelContent::default() };
+        assert_eq!(unpack(&pack(&content).unwrap()).unwrap(), content);
+        assert_eq!(unpack(&serde_json::to_vec(&content).unwrap()).unwrap(), content);
+        for bad in [&b"{"[..], b"", b"x\x9c\x00", b"neither"] {
+            assert!(unpack(bad).unwrap_err().is_damage());
+        }
+    }
+}

@@ -1,0 +1,2 @@
+-- Which jobs workers hold: few, however many wait.
+CREATE INDEX jobs_held ON jobs (lane, project_id) WHERE worker IS NOT NULL;
