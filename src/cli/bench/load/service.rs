@@ -107,11 +107,16 @@ fn look(id: u32, peaks: &Mutex<BTreeMap<u32, u64>>) {
         .flat_map(|ids| ids.split_whitespace().filter_map(|id| id.parse().ok()).collect::<Vec<_>>())
         .collect();
     all.push(id);
-    for id in all {
-        let status = fs::read_to_string(format!("/proc/{id}/status")).unwrap_or_default();
+    for process in all {
+        // One that is just being made is still a copy of the service.
+        let command = fs::read_to_string(format!("/proc/{process}/cmdline")).unwrap_or_default();
+        if process != id && command.split('\0').nth(1) != Some("work") {
+            continue;
+        }
+        let status = fs::read_to_string(format!("/proc/{process}/status")).unwrap_or_default();
         if let Some(peak) = peak_in(&status) {
             let mut peaks = peaks.lock().unwrap_or_else(PoisonError::into_inner);
-            let known = peaks.entry(id).or_default();
+            let known = peaks.entry(process).or_default();
             *known = peak.max(*known);
         }
     }
