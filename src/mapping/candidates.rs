@@ -15,6 +15,8 @@ use crate::graph::{ScanGraph, softplus};
 
 /// Hypotheses with less evidence than this propose nothing.
 const LEAST_EVIDENCE: f64 = 0.03;
+/// An edge with this evidence says something: a likelihood of 0.63.
+const LEAST_WORD: f64 = 1.0;
 /// Proposals that are tried as the centre of a cluster, at most.
 const MAX_CENTRES: usize = 200;
 
@@ -62,6 +64,12 @@ pub struct Candidate {
 pub const DECIDED: f64 = 1e6;
 
 impl Candidate {
+    /// Whether more than one edge speaks for it, or a client.
+    #[must_use]
+    pub fn rests_on_several(&self) -> bool {
+        self.decided || self.members.iter().filter(|member| member.evidence > LEAST_WORD).count() > 1
+    }
+
     /// Support with the rival's share taken off: what joins are ranked and judged by.
     #[must_use]
     pub fn margin(&self, options: &MappingOptions) -> f64 {

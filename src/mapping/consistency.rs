@@ -210,9 +210,11 @@ const WITNESS: f64 = 2.0;
 /// A pair speaks against a component only if its pose differs by this many times what makes a rival.
 const CLEARLY_DIFFERENT: f64 = 2.0;
 /// A component is contradicted when what is said against it, beyond a witness's least, comes to this for each witness for it …
-const CONTRADICTED_WEIGHT: f64 = 0.08;
-/// … and at least this many.
-const CONTRADICTED_PAIRS: usize = 3;
+const CONTRADICTED_WEIGHT: f64 = 0.05;
+/// … and at least to this, …
+const CONTRADICTED_LEAST: f64 = 3.0;
+/// … by at least this many pairs.
+const CONTRADICTED_PAIRS: usize = 2;
 
 /// A pair of scans in one component whose own evidence is for another pose than the one they have.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -238,13 +240,19 @@ pub struct Testimony {
 }
 
 impl Testimony {
-    /// Whether too much is said against the component for it to be right. Where all is right, chance says at most 0.02 for each
-    /// witness; where alike rooms were folded onto each other it is 0.15 and more.
+    /// Whether too much is said against the component for it to be right. Where all is right, chance says at most 0.03 for each
+    /// witness; where alike rooms were folded onto each other it is 0.05 and more, mostly far more.
     #[must_use]
     pub fn condemns(&self) -> bool {
         let weight: f64 = self.contradictions.iter().map(|c| c.evidence - WITNESS).sum();
         self.contradictions.len() >= CONTRADICTED_PAIRS
-            && weight >= CONTRADICTED_WEIGHT * self.agreeing.max(1) as f64
+            && weight >= (CONTRADICTED_WEIGHT * self.agreeing as f64).max(CONTRADICTED_LEAST)
+    }
+
+    /// The contradictions between scans of a component, the surest first.
+    pub fn inside<'t>(&'t self, component: &'t Component) -> impl Iterator<Item = &'t Contradiction> {
+        let within = |scan: ScanKey| component.poses.contains_key(&scan);
+        self.contradictions.iter().filter(move |c| within(c.pair.a) && within(c.pair.b))
     }
 }
 

@@ -215,6 +215,8 @@ impl Mapper {
                 let found =
                     candidates(graph, &self.components[a], &self.components[b], voxel, options, CLUSTERS);
                 match found.first() {
+                    // Two pieces share more than one edge, or what they share is a coincidence.
+                    Some(best) if !best.rests_on_several() && !options.is_strictest(level) => {}
                     Some(best) if best.support >= level.support => {
                         ranked.push((best.margin(options), a, b, found));
                     }

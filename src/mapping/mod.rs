@@ -25,6 +25,7 @@ mod snapshot;
 mod surfaces;
 mod track_refinement;
 mod tracks;
+mod undecided;
 mod undo;
 
 pub use decision::{Decision, Decisions, Verdict};

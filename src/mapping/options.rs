@@ -65,13 +65,28 @@ pub struct MappingOptions {
     pub decisions: Decisions,
 }
 
+impl MappingOptions {
+    /// Whether a level asks as much as any.
+    #[must_use]
+    pub fn is_strictest(&self, level: &JoinLevel) -> bool {
+        self.levels.iter().all(|other| other.support <= level.support)
+    }
+
+    /// The levels at which joins are firm: what they put together needs no second thought.
+    #[must_use]
+    pub fn firm_levels(&self) -> &[JoinLevel] {
+        let firm = self.levels.iter().take_while(|level| level.support >= self.firm_support).count();
+        &self.levels[..firm]
+    }
+}
+
 impl Default for MappingOptions {
     fn default() -> Self {
         let level = |support, violation, initial_matches| JoinLevel { support, violation, initial_matches };
         Self {
             seed: Seed(0),
             support: SupportOptions::default(),
-            retrieved: 20,
+            retrieved: 14,
             widening_rounds: 6,
             levels: vec![
                 level(8.0, 0.08, 100),

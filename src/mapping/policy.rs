@@ -2,13 +2,14 @@
 //!
 //! At each level of strictness, strictest first: register the next scan into a component; else merge two components; else start
 //! a component from an initial pair. Any success goes back to the strictest level, because the model has grown and what waited may
-//! now be well supported. When nothing fits at any level, misplaced scans are filtered and tried again, and retrieval widens
-//! for what stays apart. What is left then waits.
+//! now be well supported. When nothing fits, misplaced scans are filtered and tried again, and retrieval widens for what stays apart.
+//! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. What
+//! is left then waits.
 
 use std::collections::BTreeSet;
 
 use super::mapper::Mapper;
-use super::options::MappingOptions;
+use super::options::{JoinLevel, MappingOptions};
 use crate::control::{Cancelled, Control, Stage};
 use crate::graph::ScanGraph;
 use crate::pairwise::PairResult;
@@ -28,8 +29,9 @@ pub fn grow(
     let mut rounds = 0;
     let mut undone = 0;
     let mut options = options.clone();
+    let mut levels = options.firm_levels().to_vec();
     loop {
-        join_all(mapper, graph, voxel, &options, control)?;
+        join_all(mapper, graph, &levels, voxel, &options, control)?;
         if mapper.filter_scans(graph, voxel, &options) > 0 {
             continue;
         }
@@ -42,11 +44,14 @@ pub fn grow(
         }
         let fresh: BTreeSet<_> =
             if rounds < options.widening_rounds { mapper.widen(graph, &options) } else { BTreeSet::new() };
-        if fresh.is_empty() {
+        if !fresh.is_empty() {
+            rounds += 1;
+            pairs.extend(graph.try_pairs(&fresh, &options.support, control)?);
+        } else if levels.len() < options.levels.len() {
+            levels.clone_from(&options.levels);
+        } else {
             break;
         }
-        rounds += 1;
-        pairs.extend(graph.try_pairs(&fresh, &options.support, control)?);
     }
     if mapper.refinement_is_due(&options) {
         mapper.refine(graph, voxel, &options, control)?;
@@ -59,13 +64,14 @@ pub fn grow(
 fn join_all(
     mapper: &mut Mapper,
     graph: &ScanGraph,
+    levels: &[JoinLevel],
     voxel: f64,
     options: &MappingOptions,
     control: Control<'_>,
 ) -> Result<(), Cancelled> {
     let total = mapper.registered() + mapper.waiting.len();
     let mut level = 0;
-    while let Some(rules) = options.levels.get(level) {
+    while let Some(rules) = levels.get(level) {
         control.check()?;
         let joined = mapper.register_next_scan(graph, rules, voxel, options, control)?.is_some()
             || mapper.merge_components(graph, rules, voxel, options, control)?

@@ -12,6 +12,7 @@ use super::join::Refusal;
 use super::mapper::Mapper;
 use super::open_join::Undone;
 use super::options::MappingOptions;
+use super::undecided::{Undecided, smaller_side, undecided};
 use crate::cloud::ScanKey;
 use crate::graph::ScanGraph;
 
@@ -22,10 +23,14 @@ const AGAINST_PAIRS: usize = 2;
 /// Contradictions whose separation is tried, the strongest first.
 const TRIED: usize = 8;
 
-/// The weakest place of a component, given what speaks against it.
-struct Tear {
-    side: BTreeSet<ScanKey>,
-    strongest: Contradiction,
+/// What is to be done about a component, given what speaks against it.
+enum Finding {
+    /// Nothing.
+    Sound,
+    /// Alike places were taken for one, or nothing tells which of two is right: nothing of it is kept.
+    Folded { strongest: Contradiction },
+    /// One join in it is wrong: that of this side.
+    Torn { side: BTreeSet<ScanKey>, strongest: Contradiction },
 }
 
 impl Mapper {
@@ -47,17 +52,23 @@ impl Mapper {
             }
             let supports = supports(graph, &component, options);
             let testimony = testimony(graph, &self.with_torn(graph, &component, voxel, options), options);
-            if let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) {
-                self.undone.push(record(&supports, component.poses.keys().copied().collect(), strongest));
-                self.doubt(component, &testimony);
-                bans.get_or_insert_with(Vec::new);
-            } else if let Some(tear) = tear(&component, &supports, &testimony) {
-                bans.get_or_insert_with(Vec::new).extend(ban(graph, &component, &supports, &tear.side));
-                self.undone.push(record(&supports, tear.side.iter().copied().collect(), &tear.strongest));
-                pending.extend(component.split_off(&tear.side, options));
-                pending.push(component);
-            } else {
-                self.components.push(component);
+            match finding(graph, &component, &supports, &testimony, voxel, options) {
+                Finding::Sound => self.components.push(component),
+                Finding::Folded { strongest } => {
+                    self.undone.push(record(
+                        &supports,
+                        component.poses.keys().copied().collect(),
+                        &strongest,
+                    ));
+                    self.doubt(component, &testimony);
+                    bans.get_or_insert_with(Vec::new);
+                }
+                Finding::Torn { side, strongest } => {
+                    bans.get_or_insert_with(Vec::new).extend(ban(graph, &component, &supports, &side));
+                    self.undone.push(record(&supports, side.iter().copied().collect(), &strongest));
+                    pending.extend(component.split_off(&side, options));
+                    pending.push(component);
+                }
             }
         }
         self.dissolve_small();
@@ -76,29 +87,42 @@ impl Mapper {
     }
 }
 
-/// Where a component comes apart: the cut between two contradicting scans that holds least compared with what speaks against it.
+fn finding(
+    graph: &ScanGraph,
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    testimony: &Testimony,
+    voxel: f64,
+    options: &MappingOptions,
+) -> Finding {
+    if let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) {
+        return Finding::Folded { strongest: *strongest };
+    }
+    if let Some((side, strongest)) = tear(component, supports, testimony) {
+        return Finding::Torn { side, strongest };
+    }
+    match undecided(graph, component, testimony, voxel, options) {
+        Some(Undecided { strongest, rivals: true, .. }) => Finding::Folded { strongest },
+        Some(Undecided { side, strongest, .. }) => Finding::Torn { side, strongest },
+        None => Finding::Sound,
+    }
+}
+
+/// Where a component comes apart: the cut between two contradicting scans that holds least compared with what speaks against it, by its
+/// smaller side, and the pair that shows it.
 fn tear(
     component: &Component,
     supports: &BTreeMap<(ScanKey, ScanKey), f64>,
     testimony: &Testimony,
-) -> Option<Tear> {
-    let inside: Vec<&Contradiction> = testimony
-        .contradictions
-        .iter()
-        .filter(|c| component.poses.contains_key(&c.pair.a) && component.poses.contains_key(&c.pair.b))
-        .collect();
+) -> Option<(BTreeSet<ScanKey>, Contradiction)> {
+    let inside: Vec<&Contradiction> = testimony.inside(component).collect();
     for strongest in inside.iter().take(TRIED) {
         let (side, support) = separating_cut(component, supports, strongest.pair.a, strongest.pair.b)?;
         let across: Vec<&&Contradiction> =
             inside.iter().filter(|c| side.contains(&c.pair.a) != side.contains(&c.pair.b)).collect();
         let against: f64 = across.iter().map(|c| c.evidence).sum();
         if across.len() >= AGAINST_PAIRS && against >= AGAINST_SHARE * support {
-            let side = if 2 * side.len() > component.len() {
-                component.poses.keys().filter(|key| !side.contains(key)).copied().collect()
-            } else {
-                side
-            };
-            return Some(Tear { side, strongest: **strongest });
+            return Some((smaller_side(component, side), **strongest));
         }
     }
     None

@@ -1,0 +1,220 @@
+//! Whether a grown component would still be joined as it is. Joins are made one at a time, each on what is known then, and near-alike places
+//! (a symmetric hall, identical rooms) can take in scan after scan by a small lead each. With all of it there, the sides of the doubtful
+//! cut are weighed against each other as two components: where the runner-up is nearly as good, nothing tells which is right. Used by
+//! `undo`.
+
+use std::collections::BTreeSet;
+
+use super::candidates::{CLUSTERS, candidates};
+use super::component::Component;
+use super::consistency::{Contradiction, Testimony};
+use super::join::{Refusal, weigh_join};
+use super::options::{JoinLevel, MappingOptions};
+use crate::cloud::ScanKey;
+use crate::geometry::Pose;
+use crate::graph::{ScanGraph, softplus};
+use crate::pairwise::centred_difference;
+
+/// A runner-up with this share of the support is nearly as good.
+const NEARLY_AS_GOOD: f64 = 0.65;
+/// Contradictions from which a cut is sought, the strongest first.
+const TRIED: usize = 8;
+/// Evidence for another pose below this is noise: a likelihood of 0.63.
+const LEAST_DOUBT: f64 = 1.0;
+/// A gain of a move below this is rounding.
+const NO_GAIN: f64 = -1e-9;
+
+/// Two sides of a component that would not be joined as they are.
+pub struct Undecided {
+    /// The smaller side.
+    pub side: BTreeSet<ScanKey>,
+    /// The pair that led to it.
+    pub strongest: Contradiction,
+    /// Both poses are about as good; otherwise another is better.
+    pub rivals: bool,
+}
+
+/// The first of the component's doubtful cuts, the most doubtful first, whose two sides a join would not put together as they are. `voxel`
+/// in metres.
+pub fn undecided(
+    graph: &ScanGraph,
+    component: &Component,
+    testimony: &Testimony,
+    voxel: f64,
+    options: &MappingOptions,
+) -> Option<Undecided> {
+    let votes = Votes::of(graph, component, options);
+    let mut cuts: Vec<(f64, BTreeSet<ScanKey>, Contradiction)> = Vec::new();
+    for strongest in testimony.inside(component).take(TRIED) {
+        let (Some(a), Some(b)) = (votes.index(strongest.pair.a), votes.index(strongest.pair.b)) else {
+            continue;
+        };
+        for alone in [true, false] {
+            let (weight, side) = votes.descend(a, b, alone);
+            if weight < 0.0 && cuts.iter().all(|(_, known, _)| *known != side) {
+                cuts.push((weight, side, *strongest));
+            }
+        }
+    }
+    cuts.sort_by(|x, y| x.0.total_cmp(&y.0).then_with(|| x.1.cmp(&y.1)));
+    cuts.into_iter().find_map(|(_, side, strongest)| {
+        let rivals = reweigh(graph, component, &side, voxel, options)?;
+        let side = smaller_side(component, side);
+        Some(Undecided { side, strongest, rivals })
+    })
+}
+
+/// Joins the two sides anew: `Some(true)` if rivals forbid it, `Some(false)` if another pose is better, `None` if it is what it was.
+fn reweigh(
+    graph: &ScanGraph,
+    component: &Component,
+    side: &BTreeSet<ScanKey>,
+    voxel: f64,
+    options: &MappingOptions,
+) -> Option<bool> {
+    // What is joined already need show no least support; a rival may have its share of it, however firm it is.
+    let level = JoinLevel { support: 0.0, ..*options.levels.last()? };
+    let options = MappingOptions { rival_share: 1.0 / NEARLY_AS_GOOD, ..options.clone() };
+    let mut rest = component.clone();
+    let part = rest.split_off(side, &options)?;
+    let model_from = |piece: &Component| {
+        Some(*component.poses.get(&piece.gauge)? * piece.poses.get(&piece.gauge)?.inverse())
+    };
+    let now = model_from(&rest)?.inverse() * model_from(&part)?;
+    let found = candidates(graph, &rest, &part, voxel, &options, CLUSTERS);
+    let best = found.first()?;
+    // What edges alone settle needs no look at surfaces.
+    if best.margin(&options) >= level.support && !moved(graph, &part, &now, &best.a_from_b, voxel, &options) {
+        return None;
+    }
+    match weigh_join(graph, &rest, &part, &found, &level, voxel, &options) {
+        Ok(a_from_b) => moved(graph, &part, &now, &a_from_b, voxel, &options).then_some(false),
+        Err(Refusal::Rival { .. }) => Some(true),
+        Err(_) => None,
+    }
+}
+
+/// Whether two poses of a component put one of its scans at clearly different places.
+fn moved(
+    graph: &ScanGraph,
+    part: &Component,
+    x: &Pose,
+    y: &Pose,
+    voxel: f64,
+    options: &MappingOptions,
+) -> bool {
+    part.poses.iter().any(|(scan, pose)| {
+        graph.scan(*scan).is_some_and(|scan| {
+            let (angle, distance) = centred_difference(&(*x * *pose), &(*y * *pose), &scan.centroid);
+            angle > options.rival_angle || distance > options.rival_voxels * voxel
+        })
+    })
+}
+
+/// The same cut by the side with fewer scans.
+pub fn smaller_side(component: &Component, side: BTreeSet<ScanKey>) -> BTreeSet<ScanKey> {
+    if 2 * side.len() > component.len() {
+        component.poses.keys().filter(|key| !side.contains(key)).copied().collect()
+    } else {
+        side
+    }
+}
+
+/// For every two scans of a component, the share of their support for where they are that a rival may have, less what they say for
+/// another pose: negative where they lean to it.
+struct Votes {
+    keys: Vec<ScanKey>,
+    weights: Vec<f64>,
+}
+
+impl Votes {
+    fn of(graph: &ScanGraph, component: &Component, options: &MappingOptions) -> Self {
+        let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
+        let n = keys.len();
+        let mut votes = Self { keys, weights: vec![0.0; n * n] };
+        for i in 0..n {
+            for j in i + 1..n {
+                let vote = vote(graph, component, votes.keys[i], votes.keys[j], options).unwrap_or(0.0);
+                votes.weights[i * n + j] = vote;
+                votes.weights[j * n + i] = vote;
+            }
+        }
+        votes
+    }
+
+    fn index(&self, key: ScanKey) -> Option<usize> {
+        self.keys.binary_search(&key).ok()
+    }
+
+    /// The lightest cut between two scans that moving one scan at a time finds, from `from` alone on its side or all but `to`: its weight,
+    /// and the side of `from`. Weights may be negative, so there is no exact method that is fast.
+    fn descend(&self, from: usize, to: usize, alone: bool) -> (f64, BTreeSet<ScanKey>) {
+        let n = self.keys.len();
+        let mut inside: Vec<bool> = (0..n).map(|i| if alone { i == from } else { i != to }).collect();
+        let weight = |i: usize, j: usize| self.weights[i * n + j];
+        // Every move makes the cut lighter, so no division comes twice.
+        loop {
+            let gain = |i: usize| -> f64 {
+                (0..n).map(|j| if inside[j] == inside[i] { weight(i, j) } else { -weight(i, j) }).sum()
+            };
+            let lightest = (0..n)
+                .filter(|i| *i != from && *i != to)
+                .map(|i| (gain(i), i))
+                .min_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
+            match lightest {
+                Some((gain, i)) if gain < NO_GAIN => inside[i] = !inside[i],
+                _ => break,
+            }
+        }
+        let across = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
+        let cut = across.filter(|&(i, j)| inside[i] != inside[j]).map(|(i, j)| weight(i, j)).sum();
+        (cut, (0..n).filter(|i| inside[*i]).map(|i| self.keys[i]).collect())
+    }
+}
+
+fn vote(
+    graph: &ScanGraph,
+    component: &Component,
+    a: ScanKey,
+    b: ScanKey,
+    options: &MappingOptions,
+) -> Option<f64> {
+    let (edge, scan) = (graph.edge(a, b)?, graph.scan(b)?);
+    let now = component.poses.get(&a)?.inverse() * *component.poses.get(&b)?;
+    let reach = options.rival_voxels * scan.prepared.resolution;
+    let (mut support, mut doubt) = (0.0_f64, 0.0_f64);
+    for h in &edge.hypotheses {
+        let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, &now, &scan.centroid);
+        if angle > options.rival_angle || distance > reach {
+            doubt = doubt.max(softplus(h.score.max(h.hypothesis.logit)));
+        } else {
+            support = support.max(softplus(h.score));
+        }
+    }
+    Some(NEARLY_AS_GOOD * support - if doubt > LEAST_DOUBT { doubt } else { 0.0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_halves_that_lean_to_another_pose_are_found() {
+        // Two triangles that hold firmly; across, most pairs lean the other way.
+        let n = 6;
+        let mut votes = Votes { keys: (1..=6).map(ScanKey).collect(), weights: vec![0.0; n * n] };
+        for i in 0..n {
+            for j in 0..n {
+                if i != j {
+                    votes.weights[i * n + j] = if (i < 3) == (j < 3) { 4.0 } else { -0.5 };
+                }
+            }
+        }
+        votes.weights[2 * n + 3] = 1.0;
+        votes.weights[3 * n + 2] = 1.0;
+        let (weight, side) = votes.descend(0, 5, true);
+        assert_eq!(side, (1..=3).map(ScanKey).collect());
+        assert!((weight - (8.0 * -0.5 + 1.0)).abs() < 1e-12);
+        assert_eq!(votes.descend(0, 5, false), (weight, side));
+    }
+}
