@@ -10,6 +10,8 @@ const ENOUGH_VOXELS: usize = 4000;
 const POINTS_A_VOXEL: f64 = 2.5;
 /// Steps of the ladder per factor of two.
 const LADDER: f64 = 8.0;
+/// No voxel is made smaller than this, metres: it is the finest resolution that a project may be set to.
+const FINEST: f64 = 1e-5;
 /// Used when there are no scans. Metres.
 const DEFAULT_RESOLUTION: f64 = 0.05;
 
@@ -40,13 +42,15 @@ pub fn natural_resolution(points: &[Point]) -> f64 {
     }
     let step = 0.5_f64.powf(1.0 / LADDER);
     let mut occupied = occupied_voxels(points, size as f32);
-    while occupied < ENOUGH_VOXELS {
+    while occupied < ENOUGH_VOXELS && size > FINEST {
         let smaller = size * step;
         let more = occupied_voxels(points, smaller as f32);
         if (points.len() as f64) < POINTS_A_VOXEL * more as f64 {
             break;
         }
-        size = smaller;
+        // Where points lie on each other, smaller voxels may show no more however small they are.
+        let no_more = more == occupied && occupied_voxels(points, (size / 2.0) as f32) == occupied;
+        size = if no_more { size / 2.0 } else { smaller };
         occupied = more;
     }
     size
@@ -83,6 +87,13 @@ mod tests {
         let few = choose_resolution(&[0.049, 0.050, 0.051]);
         assert!((choose_resolution(&[0.051, 0.049, 0.050, 0.0501]) - few).abs() < 1e-12);
         assert!((choose_resolution(&[]) - 0.05).abs() < 1e-12);
+    }
+
+    #[test]
+    fn copies_of_a_few_points_come_to_an_end() {
+        let few: Vec<Point> = (0..1000).map(|i| [(i % 5) as f32, (i % 3) as f32, 0.0]).collect();
+        let size = natural_resolution(&few);
+        assert!(size > FINEST / 4.0 && size < 0.1, "{size}");
     }
 
     #[test]

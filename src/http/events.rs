@@ -11,6 +11,7 @@ use futures_util::Stream;
 use futures_util::stream::unfold;
 use tokio::sync::broadcast;
 use tokio_util::sync::CancellationToken;
+use utoipa::ToSchema;
 
 use super::extract::Ids;
 use super::job::JobBody;
@@ -22,6 +23,18 @@ use crate::storage::Store;
 /// Silence after which a comment keeps proxies from closing the connection.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
+/// One event, in the words of OpenAPI.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "only describes events, which are written field by field")]
+struct JobEvent {
+    /// The job's revision.
+    id: String,
+    /// The job's status.
+    event: String,
+    /// The job, as JSON.
+    data: String,
+}
+
 /// Follows a job. Every event is named after the job's status, holds the whole job and has its revision as id, so that a
 /// client that comes back with `Last-Event-ID` gets the job as it is now, unless it has that already. The stream ends
 /// with the job.
@@ -29,7 +42,7 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
     ("job" = String, Path, description = "Id of the job"),
     ("last-event-id" = Option<String>, Header, description = "The id of the last event that the client has")),
     responses(
-    (status = 200, description = "The events", body = String, content_type = "text/event-stream"),
+    (status = 200, description = "The events", body = JobEvent, content_type = "text/event-stream"),
     (status = 204, description = "The job has ended, and the client has its last event"),
     Problems))]
 pub(super) async fn follow_job(

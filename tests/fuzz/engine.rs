@@ -93,11 +93,14 @@ fn put(name: &str, input: &[u8]) -> PathBuf {
 }
 
 /// What is being tried, seen by a thread that reports an input that takes too long.
-struct Watched(Arc<Mutex<Option<(Instant, Vec<u8>)>>>);
+struct Watched(Arc<Mutex<Option<Trial>>>);
+
+/// Since when which input is being tried.
+type Trial = (Instant, Vec<u8>);
 
 impl Watched {
     fn begin(name: &str) -> Self {
-        let shared = Arc::new(Mutex::new(None));
+        let shared = Arc::new(Mutex::new(None::<Trial>));
         let (seen, name) = (Arc::downgrade(&shared), name.to_owned());
         // It ends with the parser that it watches.
         thread::spawn(move || {
