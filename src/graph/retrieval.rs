@@ -8,6 +8,7 @@ use rayon::prelude::*;
 
 use super::scan_graph::ScanGraph;
 use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
 use crate::features::SIGNATURE_LEN;
 use crate::pairwise::{PairKey, Probe, probe};
 
@@ -43,19 +44,13 @@ impl<'g> Retrieval<'g> {
         Self { graph, centred }
     }
 
-    /// All other scans, the likeliest to overlap first, each with how much likelier than the average of those probed (in standard
-    /// deviations). Ties by key. Nothing for a scan that is not in the graph.
-    #[must_use]
-    pub fn ranked(&self, key: ScanKey) -> Vec<(ScanKey, f32)> {
-        self.ranked_all([key]).remove(&key).unwrap_or_default()
-    }
-
-    /// [`Retrieval::ranked`] of several scans; a pair of them is probed only once.
-    #[must_use]
-    pub fn ranked_all(
+    /// For each scan all others, the likeliest to overlap first, each with how much likelier than the average of those probed (in standard
+    /// deviations). Ties by key. Nothing for a scan that is not in the graph. A pair of the scans asked about is probed only once.
+    pub fn ranked(
         &self,
         keys: impl IntoIterator<Item = ScanKey>,
-    ) -> BTreeMap<ScanKey, Vec<(ScanKey, f32)>> {
+        control: Control<'_>,
+    ) -> Result<BTreeMap<ScanKey, Vec<(ScanKey, f32)>>, Cancelled> {
         let similar: BTreeMap<ScanKey, Vec<(ScanKey, f32)>> =
             keys.into_iter().map(|key| (key, self.similar(key))).collect();
         let pairs: BTreeSet<PairKey> = similar
@@ -66,9 +61,10 @@ impl<'g> Retrieval<'g> {
             .into_iter()
             .collect::<Vec<_>>()
             .into_par_iter()
-            .filter_map(|pair| Some((pair, probe(self.graph.scan(pair.a)?, self.graph.scan(pair.b)?))))
-            .collect();
-        similar.into_iter().map(|(key, others)| (key, ranking(key, others, &probes))).collect()
+            .filter_map(|pair| Some((pair, self.graph.scan(pair.a)?, self.graph.scan(pair.b)?)))
+            .map(|(pair, a, b)| control.check().map(|()| (pair, probe(a, b))))
+            .collect::<Result<_, Cancelled>>()?;
+        Ok(similar.into_iter().map(|(key, others)| (key, ranking(key, others, &probes))).collect())
     }
 
     /// All other scans, the most similar signature first.
@@ -120,19 +116,17 @@ fn standardised(mut values: Vec<f32>) -> Vec<f32> {
 }
 
 /// The pairs of each of `scans` with the `top` scans that are likeliest to overlap it: the union over `scans`.
-#[must_use]
 pub fn retrieve(
     retrieval: &Retrieval<'_>,
     scans: impl IntoIterator<Item = ScanKey>,
     top: usize,
-) -> BTreeSet<PairKey> {
-    retrieval
-        .ranked_all(scans)
-        .into_iter()
-        .flat_map(|(scan, others)| {
-            others.into_iter().take(top).map(move |(other, _)| PairKey::of(scan, other))
-        })
-        .collect()
+    control: Control<'_>,
+) -> Result<BTreeSet<PairKey>, Cancelled> {
+    let ranked = retrieval.ranked(scans, control)?;
+    let nearest = |(scan, others): (ScanKey, Vec<(ScanKey, f32)>)| {
+        others.into_iter().take(top).map(move |(other, _)| PairKey::of(scan, other))
+    };
+    Ok(ranked.into_iter().flat_map(nearest).collect())
 }
 
 #[cfg(test)]
@@ -163,7 +157,7 @@ mod tests {
                 .expect("the scan is large enough");
             graph.add_scan(Arc::new(Scan::new(prepared)));
         }
-        let ranked = Retrieval::new(&graph).ranked_all(graph.scans().map(|s| s.key()));
+        let ranked = Retrieval::new(&graph).ranked(graph.scans().map(|s| s.key()), control).unwrap();
         let overlap = |x: ScanKey, y: ScanKey| overlaps[x.0 as usize][y.0 as usize];
         let mean = |part: fn(&[(ScanKey, f32)]) -> Vec<ScanKey>| {
             let all: Vec<f64> = ranked
@@ -176,8 +170,10 @@ mod tests {
         let last = mean(|others| others[8..].iter().map(|o| o.0).collect());
         assert!(ranked.values().all(|others| others.len() == 11));
         assert!(first > 2.0 * last, "the first three overlap by {first:.2}, the last three by {last:.2}");
-        let pairs = retrieve(&Retrieval::new(&graph), [ScanKey(4)], 3);
+        let pairs = retrieve(&Retrieval::new(&graph), [ScanKey(4)], 3, control).unwrap();
         assert_eq!(pairs.len(), 3);
-        assert!(Retrieval::new(&graph).ranked(ScanKey(99)).is_empty());
+        assert!(Retrieval::new(&graph).ranked([ScanKey(99)], control).unwrap()[&ScanKey(99)].is_empty());
+        token.cancel();
+        assert!(Retrieval::new(&graph).ranked([ScanKey(4)], control).is_err());
     }
 }

@@ -103,7 +103,7 @@ impl LiveModel {
         if fresh.is_empty() {
             return Ok(());
         }
-        let pairs = retrieve(&Retrieval::new(&next.graph), fresh, next.options.retrieved);
+        let pairs = retrieve(&Retrieval::new(&next.graph), fresh, next.options.retrieved, control)?;
         next.try_pairs(&pairs, control)?;
         next.mapper.loosen(&next.graph, next.options.firm_support, &next.options);
         next.grow(control)?;
@@ -169,7 +169,7 @@ impl LiveModel {
         for key in &keys {
             next.mapper.add_waiting(*key);
         }
-        let pairs = retrieve(&Retrieval::new(&next.graph), keys, next.options.retrieved);
+        let pairs = retrieve(&Retrieval::new(&next.graph), keys, next.options.retrieved, control)?;
         next.try_pairs(&pairs, control)?;
         next.grow(control)?;
         *self = next;

@@ -260,15 +260,19 @@ impl Mapper {
 
     /// Pairs worth a try for scans and components that stay apart: for every scan outside the largest component, its most similar
     /// scans elsewhere that were not tried yet.
-    #[must_use]
-    pub fn widen(&self, graph: &ScanGraph, options: &MappingOptions) -> BTreeSet<PairKey> {
+    pub fn widen(
+        &self,
+        graph: &ScanGraph,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<BTreeSet<PairKey>, Cancelled> {
         let largest =
             (0..self.components.len()).max_by_key(|i| (self.components[*i].len(), std::cmp::Reverse(*i)));
         let home = |scan: &ScanKey| self.components.iter().position(|c| c.poses.contains_key(scan));
         let outside =
             graph.scans().map(|s| s.key()).filter(|scan| home(scan).is_none() || home(scan) != largest);
         let mut pairs = BTreeSet::new();
-        for (scan, others) in Retrieval::new(graph).ranked_all(outside) {
+        for (scan, others) in Retrieval::new(graph).ranked(outside, control)? {
             let own = home(&scan);
             let fresh = others
                 .into_iter()
@@ -276,7 +280,7 @@ impl Mapper {
                 .filter(|other| (own.is_none() || home(other) != own) && graph.edge(scan, *other).is_none());
             pairs.extend(fresh.take(options.retrieved).map(|other| PairKey::of(scan, other)));
         }
-        pairs
+        Ok(pairs)
     }
 
     /// Refines every component that grew: pose graph, then joint dense adjustment, then tracks at the new poses.

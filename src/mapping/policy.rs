@@ -35,15 +35,18 @@ pub fn grow(
         if mapper.filter_scans(graph, voxel, &options) > 0 {
             continue;
         }
-        if let Some(bans) = mapper.undo_contradicted(graph, voxel, &options) {
+        if let Some(bans) = mapper.undo_contradicted(graph, voxel, &options, control)? {
             undone += 1;
             options.decisions = options.decisions.with(&bans);
             if undone < MAX_UNDONE {
                 continue;
             }
         }
-        let fresh: BTreeSet<_> =
-            if rounds < options.widening_rounds { mapper.widen(graph, &options) } else { BTreeSet::new() };
+        let fresh: BTreeSet<_> = if rounds < options.widening_rounds {
+            mapper.widen(graph, &options, control)?
+        } else {
+            BTreeSet::new()
+        };
         if !fresh.is_empty() {
             rounds += 1;
             pairs.extend(graph.try_pairs(&fresh, &options.support, control)?);

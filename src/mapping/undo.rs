@@ -14,6 +14,7 @@ use super::open_join::Undone;
 use super::options::MappingOptions;
 use super::undecided::{Undecided, smaller_side, undecided};
 use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
 use crate::graph::ScanGraph;
 
 /// A join is undone when what pairs say against it comes to this share of its support …
@@ -41,10 +42,12 @@ impl Mapper {
         graph: &ScanGraph,
         voxel: f64,
         options: &MappingOptions,
-    ) -> Option<Vec<Decision>> {
+        control: Control<'_>,
+    ) -> Result<Option<Vec<Decision>>, Cancelled> {
         let mut pending = std::mem::take(&mut self.components);
         let mut bans = None;
         while let Some(mut component) = pending.pop() {
+            control.check()?;
             // Where a client joined scans, the client has the last word.
             if options.decisions.joined_pairs().any(|pair| component.poses.contains_key(&pair.a)) {
                 self.components.push(component);
@@ -73,7 +76,7 @@ impl Mapper {
         }
         self.dissolve_small();
         self.sort_components();
-        bans
+        Ok(bans)
     }
 
     /// Lets the scans of a component wait, and not be joined before all is decided anew.
