@@ -11,6 +11,7 @@ mod download;
 mod events;
 mod extract;
 mod graph;
+mod hang_up;
 mod health;
 mod idempotency;
 mod job;

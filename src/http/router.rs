@@ -127,6 +127,7 @@ pub fn router(api: Api) -> Router {
         .layer(SetSensitiveRequestHeadersLayer::new([header::AUTHORIZATION]))
         .layer(TraceLayer::new_for_http().make_span_with(span))
         .layer(PropagateRequestIdLayer::new(id))
+        .layer(from_fn(super::hang_up::hang_up))
         .layer(CatchPanicLayer::custom(panicked));
     let (router, _) = routes().split_for_parts();
     router

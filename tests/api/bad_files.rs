@@ -94,3 +94,16 @@ async fn each_bad_file_gets_a_clear_answer_and_good_ones_are_registered_all_the_
     assert_eq!(server.get("/readyz").await.status(), 200);
     server.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_whose_upload_is_refused_unread_is_told_to_open_another_connection() {
+    let server = Server::start().await;
+    let project = server.project().await;
+    let refused = server.upload(&project, "name=j%FF%FE.ply", room(0.6)).await;
+    assert_eq!(
+        (refused.status().as_u16(), &refused.headers()["connection"]),
+        (400, &"close".parse().unwrap())
+    );
+    let taken = server.upload(&project, "name=good.ply", room(0.6)).await;
+    assert!(taken.status() == 202 && !taken.headers().contains_key("connection"));
+}
