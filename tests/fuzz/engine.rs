@@ -14,7 +14,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
 use crate::mutate::{Pool, mutate};
-use crate::{corpus, memory};
+use crate::{corpus, machine};
 
 /// Inputs of the short form.
 const SHORT: u64 = 4000;
@@ -43,9 +43,10 @@ pub fn fuzz(name: &str, dictionary: &[&str], check: fn(&[u8]) -> String) {
     for input in pool.inputs.clone() {
         kinds.insert(kind(&attempt(name, &input, &check)));
     }
-    let (start, known) = (Instant::now(), kinds.len());
+    let (start, known) = (machine::processor_time(), kinds.len());
+    let elapsed = || machine::processor_time().saturating_sub(start);
     let (mut tried, mut slowest) = (0, (Duration::ZERO, Vec::new()));
-    while minutes.map_or(tried < SHORT, |m| start.elapsed() < Duration::from_mins(m)) {
+    while minutes.map_or(tried < SHORT, |m| elapsed() < Duration::from_mins(m)) {
         let mut input = pool.inputs[rng.random_range(0..pool.inputs.len())].clone();
         for _ in 0..1 << rng.random_range(0..4) {
             mutate(&mut input, &pool, &mut rng);
@@ -64,12 +65,12 @@ pub fn fuzz(name: &str, dictionary: &[&str], check: fn(&[u8]) -> String) {
         }
         tried += 1;
         if tried % LOOK == 0 {
-            memory::check(name);
+            machine::check(name);
         }
     }
     println!(
-        "{name}: {tried} inputs in {:.0} s, {known} kinds of answers of the corpus, {} in the end; the slowest took {:.1} ms ({} bytes)",
-        start.elapsed().as_secs_f64(),
+        "{name}: {tried} inputs in {:.0} CPU s, {known} kinds of answers of the corpus, {} in the end; the slowest took {:.1} ms ({} bytes)",
+        elapsed().as_secs_f64(),
         kinds.len(),
         slowest.0.as_secs_f64() * 1e3,
         slowest.1.len(),

@@ -14,7 +14,8 @@
 
 mod corpus;
 mod engine;
-mod memory;
+mod machine;
+
 mod mutate;
 mod targets;
 
