@@ -9,6 +9,7 @@ use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::extract::{Body, Ids};
+use super::idempotency::{Once, Reply};
 use super::job::JobBody;
 use super::link::Link;
 use super::problem::{Problem, Problems};
@@ -16,7 +17,7 @@ use super::query::{Params, cursor};
 use super::router::Api;
 use crate::geometry::Pose;
 use crate::project::{
-    Decision, DecisionId, KeptDecision, ProjectId, ScanId, Timestamp, Verdict, VersionNumber, motion,
+    Decision, DecisionId, Job, KeptDecision, ProjectId, ScanId, Timestamp, Verdict, VersionNumber, motion,
 };
 use crate::storage::StorageError;
 
@@ -120,21 +121,22 @@ impl DecisionBody {
 pub(super) async fn create_decision(
     State(api): State<Api>,
     Ids(project): Ids<ProjectId>,
+    once: Once,
     Body(new): Body<NewDecision>,
-) -> Result<impl IntoResponse, Problem> {
+) -> Result<Reply, Problem> {
     api.store.project(project).await?;
     let decision = checked(&api, project, &new).await?;
-    let (kept, job) = api.store.decide(project, &decision).await.map_err(|e| match e {
+    let answer = |(kept, job): &(KeptDecision, Job)| {
+        let location = format!("/v1/jobs/{}", job.id);
+        let body = DecidedBody { decision: DecisionBody::new(project, kept), job: job.clone().into() };
+        Reply::made(StatusCode::ACCEPTED, location, &[(header::RETRY_AFTER, "1")]).json(&body)
+    };
+    let done = api.store.decide(project, &decision, once.seal(answer)).await.map_err(|e| match e {
         // Whoever names a scan in a body is told which field names it.
         StorageError::NoScan(id) => Problem::invalid(field_of(&decision, id), e.to_string()),
         other => other.into(),
     })?;
-    let location = format!("/v1/jobs/{}", job.id);
-    Ok((
-        StatusCode::ACCEPTED,
-        [(header::LOCATION, location), (header::RETRY_AFTER, "1".to_owned())],
-        Json(DecidedBody { decision: DecisionBody::new(project, &kept), job: job.into() }),
-    ))
+    answer(&done)
 }
 
 /// Lists the decisions that hold.

@@ -13,6 +13,7 @@ use utoipa::ToSchema;
 use super::access::Caller;
 use super::download::none_match;
 use super::extract::{Body, Ids};
+use super::idempotency::{Once, Reply};
 use super::link::Link;
 use super::problem::{Problem, Problems};
 use super::query::{Params, cursor};
@@ -126,19 +127,20 @@ pub(super) async fn create_job(
     State(api): State<Api>,
     Ids(project): Ids<ProjectId>,
     caller: Caller,
+    once: Once,
     Body(new): Body<NewJob>,
-) -> Result<impl IntoResponse, Problem> {
+) -> Result<Reply, Problem> {
     let kind = new.kind.parse::<JobKind>().ok().filter(|k| k.on_request()).ok_or_else(|| {
         let words: Vec<_> = JobKind::ALL.iter().filter(|k| k.on_request()).map(|k| k.as_str()).collect();
         Problem::invalid("kind", format!("the kind must be one of {}", words.join(", ")))
     })?;
-    let job = api.store.create_job(project, kind, caller.key()).await?;
-    let location = format!("/v1/jobs/{}", job.id);
-    Ok((
-        StatusCode::ACCEPTED,
-        [(header::LOCATION, location), (header::RETRY_AFTER, "1".to_owned())],
-        Json(JobBody::from(job)),
-    ))
+    let answer = |job: &Job| {
+        let location = format!("/v1/jobs/{}", job.id);
+        Reply::made(StatusCode::ACCEPTED, location, &[(header::RETRY_AFTER, "1")])
+            .json(&JobBody::from(job.clone()))
+    };
+    let job = api.store.create_job(project, kind, caller.key(), once.seal(answer)).await?;
+    answer(&job)
 }
 
 /// Lists the jobs of a project.

@@ -2,13 +2,13 @@
 
 use axum::Json;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
-use axum::response::IntoResponse;
+use axum::http::StatusCode;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::access::Caller;
 use super::extract::{Body, Ids};
+use super::idempotency::{Once, Reply};
 use super::link::Link;
 use super::problem::{Problem, Problems};
 use super::query::{Params, cursor};
@@ -93,8 +93,9 @@ impl From<Project> for ProjectBody {
     Problems))]
 pub(super) async fn create_project(
     State(api): State<Api>,
+    once: Once,
     Body(new): Body<NewProject>,
-) -> Result<impl IntoResponse, Problem> {
+) -> Result<Reply, Problem> {
     let name = Name::parse(&new.name).map_err(|e| Problem::invalid("name", e.to_string()))?;
     let settings = ProjectSettings { seed: Seed(new.seed), resolution: new.resolution };
     settings.validate().map_err(|e| {
@@ -104,9 +105,12 @@ pub(super) async fn create_project(
         };
         Problem::invalid(field, e.to_string())
     })?;
-    let project = api.store.create_project(&name, &settings).await?;
-    let location = format!("/v1/projects/{}", project.id);
-    Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(ProjectBody::from(project))))
+    let answer = |project: &Project| {
+        let location = format!("/v1/projects/{}", project.id);
+        Reply::made(StatusCode::CREATED, location, &[]).json(&ProjectBody::from(project.clone()))
+    };
+    let project = api.store.create_project(&name, &settings, once.seal(answer)).await?;
+    answer(&project)
 }
 
 /// Lists projects: those that the key reaches.

@@ -2,12 +2,12 @@
 
 use axum::Json;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
-use axum::response::IntoResponse;
+use axum::http::StatusCode;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::extract::{Body, Ids};
+use super::idempotency::{Once, Reply};
 use super::link::Link;
 use super::problem::{Problem, Problems};
 use super::query::{Params, cursor};
@@ -119,17 +119,21 @@ impl From<Delivery> for DeliveryBody {
 pub(super) async fn create_webhook(
     State(api): State<Api>,
     Ids(project): Ids<ProjectId>,
+    once: Once,
     Body(new): Body<NewWebhook>,
-) -> Result<impl IntoResponse, Problem> {
+) -> Result<Reply, Problem> {
     if new.url.len() > MAX_URL {
         return Err(Problem::invalid("url", format!("the url is longer than {MAX_URL} bytes")));
     }
     api.webhooks.target(&new.url).map_err(|error| Problem::invalid("url", error.to_string()))?;
     let secret = new_secret().map_err(Problem::internal)?;
-    let made = api.store.create_webhook(project, &new.url, &secret).await?;
-    let body = WebhookBody { secret: Some(reveal(&secret)), ..made.into() };
-    let location = format!("/v1/projects/{project}/webhooks/{}", body.id);
-    Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(body)))
+    let answer = |made: &Webhook| {
+        let location = format!("/v1/projects/{project}/webhooks/{}", made.id);
+        let body = WebhookBody { secret: Some(reveal(&secret)), ..made.clone().into() };
+        Reply::made(StatusCode::CREATED, location, &[]).json(&body)
+    };
+    let made = api.store.create_webhook(project, &new.url, &secret, once.seal(answer)).await?;
+    answer(&made)
 }
 
 /// Lists the webhooks of a project.

@@ -41,7 +41,7 @@ pub use digest::{DigestAlgorithm, DigestMismatch, ExpectedDigest};
 pub use error::JobError;
 pub use exports::{CloudRequest, ComponentChoice, ExportError, Exports};
 pub use intake::{Intake, IntakeError, UploadRequest};
-pub use isolated::{Isolated, Isolation, NOT_NOW, work_alone};
+pub use isolated::{Isolated, Isolation, NOT_NOW, Order, Report, work_for_service};
 pub use parameters::DECIDING_SCANS;
 pub use reason::{reason_of, reason_of_refusal};
 pub use resumable::{Continuation, Resumable, ResumableError};

@@ -7,7 +7,7 @@ use crate::mapping::LiveModel;
 use crate::project::{ProjectId, VersionNumber};
 
 /// At most so many models at once, least recently used first out.
-const CAPACITY: usize = 4;
+pub(super) const CAPACITY: usize = 4;
 
 /// Models by project, each exactly as its version was published.
 #[derive(Debug, Default)]
@@ -24,6 +24,18 @@ impl ModelCache {
         let model = found.2.clone();
         models.push_back(found);
         Some(model)
+    }
+
+    /// Whether a model of this project is here, of whatever version.
+    pub fn knows(&self, project: ProjectId) -> bool {
+        self.models.lock().unwrap_or_else(PoisonError::into_inner).iter().any(|(p, _, _)| *p == project)
+    }
+
+    /// Forgets all models but those of the `n` projects that were worked on last.
+    pub fn keep_newest(&self, n: usize) {
+        let mut models = self.models.lock().unwrap_or_else(PoisonError::into_inner);
+        let forgotten = models.len().saturating_sub(n);
+        models.drain(..forgotten);
     }
 
     /// Keeps the model of a version in place of an older one of the project.
@@ -52,5 +64,7 @@ mod tests {
         assert!(cache.get(ids[0], VersionNumber(1)).is_none());
         assert!(cache.get(ids[4], VersionNumber(1)).is_some());
         assert!(cache.get(ids[4], VersionNumber(2)).is_none());
+        cache.keep_newest(1);
+        assert!(cache.knows(ids[4]) && !ids[..4].iter().any(|id| cache.knows(*id)));
     }
 }

@@ -1,6 +1,6 @@
 //! Doing one job that was claimed: it runs while its claim is watched, and ends, is given back, or is set aside.
 //!
-//! Used by the loops of `workers`, and by the process that does one suspect job alone (see `isolated`).
+//! Used by the loops of `workers`, and by the processes that jobs have of their own (see `isolated`).
 
 use std::pin::pin;
 use std::sync::Arc;
@@ -11,6 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::decide::decide;
 use super::ingest::ingest;
+use super::isolated::Processes;
 use super::model_cache::ModelCache;
 use super::progress::ProgressSink;
 use super::refine::refine;
@@ -29,6 +30,8 @@ pub(super) struct Performer {
     pub store: Store,
     pub compute: Compute,
     pub models: Arc<ModelCache>,
+    /// Where jobs get processes of their own.
+    pub processes: Arc<Processes>,
     pub options: WorkerOptions,
     pub stop: CancellationToken,
     /// How long a job that was told to stop is waited for.
@@ -44,6 +47,8 @@ pub(super) enum Interruption {
     Stopping,
     /// It does not end.
     Overdue,
+    /// It takes more memory than it may.
+    TooLarge,
 }
 
 /// How long a job that was told to stop is waited for in the service. The core looks at its token every few tens of milliseconds;
@@ -56,13 +61,15 @@ const INGEST_AT_LEAST: Duration = Duration::from_mins(2);
 const INGEST_BYTES_PER_SECOND: u64 = 2_000_000;
 
 impl Performer {
-    /// Does the job and writes down how it ended.
-    pub async fn perform(&self, lane: Lane, claim: Claim) {
+    /// Does the job and writes down how it ended. Returns whether nothing is left of it: a computation that does not stop goes on
+    /// behind its back.
+    pub async fn perform(&self, lane: Lane, claim: Claim) -> bool {
         let limit = match self.time_limit(lane, &claim).await {
             Ok(limit) => limit,
             Err(error) => {
                 tracing::error!(%error, "a job cannot begin");
-                return told(self.store.postpone(&claim.lease).await);
+                told(self.store.postpone(&claim.lease).await);
+                return true;
             }
         };
         let lease = claim.lease.clone();
@@ -78,12 +85,16 @@ impl Performer {
         tracing::info!(lane = lane.as_str(), batch = 1 + lease.members.len(), "job begins");
         let mut work = pin!(run(lane, &task));
         let why = tokio::select! {
-            result = &mut work => return self.end(&lease, result).await,
+            result = &mut work => {
+                self.end(&lease, result).await;
+                return true;
+            }
             why = self.keep(&task, limit) => why,
         };
         task.cancel.cancel();
         let stopped = tokio::time::timeout(self.patience, &mut work).await;
-        if stopped.is_err() && why != Interruption::Stopping {
+        let settled = stopped.is_ok();
+        if !settled && why != Interruption::Stopping {
             tracing::error!(?why, "a computation does not stop; its thread is given up");
             self.compute.renew();
         }
@@ -93,6 +104,7 @@ impl Performer {
             (_, Ok(result)) => self.end(&lease, result).await,
             (_, Err(_)) => told(self.store.release(&lease).await),
         }
+        settled
     }
 
     /// How long the job may take. A batch takes as long as its longest.

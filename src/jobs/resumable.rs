@@ -16,7 +16,7 @@ use super::digest::{DigestCheck, DigestMismatch, ExpectedDigest};
 use super::intake::{HEAD_BYTES, Intake, IntakeError, recognise, scan_of};
 use super::turnstile::{Turn, Turnstile};
 use crate::project::{NewUpload, Timestamp, Upload, UploadEnd, UploadId};
-use crate::storage::{BlobId, FreshBlob, StorageError, Store, StoredBlob, UploadFile};
+use crate::storage::{BlobId, FreshBlob, Seal, StorageError, Store, StoredBlob, UploadFile};
 
 /// Why an upload cannot be announced, continued or looked at.
 #[derive(Debug, thiserror::Error)]
@@ -107,8 +107,8 @@ impl Resumable {
         self.intake.idle()
     }
 
-    /// Notes an upload that will come.
-    pub async fn create(&self, new: NewUpload) -> Result<Upload, ResumableError> {
+    /// Notes an upload that will come, and keeps the answer to its announcement.
+    pub async fn create(&self, new: NewUpload, seal: Seal<'_, Upload>) -> Result<Upload, ResumableError> {
         let limit = self.max_bytes();
         if new.length > limit {
             return Err(IntakeError::TooLarge { limit }.into());
@@ -116,7 +116,7 @@ impl Resumable {
         if new.length == 0 {
             return Err(IntakeError::Empty.into());
         }
-        Ok(self.store.create_upload(new, self.expiry()).await?)
+        Ok(self.store.create_upload(new, self.expiry(), seal).await?)
     }
 
     /// How far an upload has come, without disturbing who writes to it.

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{Continuation, DigestAlgorithm, ExpectedDigest, Intake, IntakeError, Resumable, ResumableError};
 use crate::project::{Interpretation, Name, NewUpload, ProjectId, ProjectSettings, UploadId};
-use crate::storage::{Page, StorageError, Store};
+use crate::storage::{Page, Seal, StorageError, Store};
 
 const LIMIT: u64 = 3000;
 
@@ -30,7 +30,8 @@ impl Service {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).await.unwrap();
         let name = Name::parse("test").unwrap();
-        let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
+        let project =
+            store.create_project(&name, &ProjectSettings::default(), Seal::none()).await.unwrap().id;
         Self { uploads: resumable(&store), store, project, dir }
     }
 
@@ -51,7 +52,7 @@ impl Service {
             length,
             sender: None,
         };
-        self.uploads.create(new).await.map(|upload| upload.id)
+        self.uploads.create(new, Seal::none()).await.map(|upload| upload.id)
     }
 
     async fn scans(&self) -> usize {

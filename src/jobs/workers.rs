@@ -72,6 +72,7 @@ impl Workers {
             store,
             compute,
             models,
+            processes: Arc::default(),
             options,
             stop: stop.clone(),
             patience: PATIENCE,
@@ -129,9 +130,10 @@ impl Pool {
     }
 
     async fn perform(&self, lane: Lane, claim: Claim) {
-        match self.0.isolates(lane, &claim) {
-            Some(isolated) => self.0.perform_isolated(isolated, lane, claim).await,
-            None => self.0.perform(lane, claim).await,
+        if let Some(isolated) = self.0.isolates(&claim) {
+            self.0.perform_isolated(isolated, lane, claim).await;
+        } else {
+            self.0.perform(lane, claim).await;
         }
     }
 

@@ -177,31 +177,22 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::project::{ContentKey, Interpretation, Name, ProjectId, ProjectSettings};
-    use crate::storage::{NewScan, Page};
+    use crate::project::ProjectId;
+    use crate::storage::Page;
+    use crate::storage::testing::{new_scan, project};
 
     const ALL: Page = Page { after: None, limit: 100 };
 
     async fn scan(store: &Store, project: ProjectId, text: &str) -> BlobId {
         let blob = store.blobs.put(text.as_bytes()).unwrap();
-        let new = NewScan {
-            project,
-            key: ContentKey(u128::from(blob.bytes)),
-            name: Name::parse("scan").unwrap(),
-            format: "ply".to_owned(),
-            blob: blob.id,
-            bytes: blob.bytes,
-            interpretation: Interpretation::default(),
-            sender: None,
-        };
+        let new = new_scan(project, u128::from(blob.bytes), *blob);
         store.admit_scan(&new).await.unwrap();
         blob.id
     }
 
     async fn filled(data: &Path) -> (Store, ProjectId) {
         let store = Store::open(data).await.unwrap();
-        let name = Name::parse("test").unwrap();
-        let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
+        let project = project(&store).await;
         scan(&store, project, "first").await;
         (store, project)
     }

@@ -143,45 +143,19 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::project::{ContentKey, Interpretation, Name, ProjectSettings, VersionNumber};
-    use crate::storage::{FreshBlob, JobFilter, NewScan, Owner, Page};
-
-    struct Fixture {
-        store: Store,
-        project: ProjectId,
-        _dir: tempfile::TempDir,
-    }
+    use crate::project::VersionNumber;
+    use crate::storage::testing::{Fixture, new_scan};
+    use crate::storage::{FreshBlob, JobFilter, Owner, Page};
 
     impl Fixture {
-        async fn new() -> Self {
-            let dir = tempfile::tempdir().unwrap();
-            let store = Store::open(dir.path()).await.unwrap();
-            let name = Name::parse("test").unwrap();
-            let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
-            Self { store, project, _dir: dir }
-        }
-
-        fn blob(&self, text: &str) -> FreshBlob {
-            self.store.blobs.put(text.as_bytes()).unwrap()
-        }
-
         fn spoil(&self, id: BlobId) {
             fs::write(self.store.blobs.path(id), "no longer what it was").unwrap();
             assert!(self.store.blobs.verify(id).is_err());
         }
 
-        async fn scan(&self) -> FreshBlob {
+        async fn uploaded(&self) -> FreshBlob {
             let blob = self.blob("upload");
-            let new = NewScan {
-                project: self.project,
-                key: ContentKey(1),
-                name: Name::parse("scan").unwrap(),
-                format: "ply".to_owned(),
-                blob: blob.id,
-                bytes: blob.bytes,
-                interpretation: Interpretation::default(),
-                sender: None,
-            };
+            let new = new_scan(self.project, 1, *blob);
             self.store.admit_scan(&new).await.unwrap();
             blob
         }
@@ -190,7 +164,7 @@ mod tests {
     #[tokio::test]
     async fn a_damaged_upload_is_told_until_the_same_bytes_come_again() {
         let f = Fixture::new().await;
-        let upload = f.scan().await;
+        let upload = f.uploaded().await;
         f.spoil(upload.id);
         assert_eq!(f.store.settle_damage().await.unwrap(), 1);
         let told = f.store.damage().await.unwrap();
@@ -208,10 +182,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let f = Fixture::new().await;
         drop(dir);
-        let upload = f.scan().await.id;
+        let upload = f.uploaded().await.id;
         f.spoil(upload);
         f.store.settle_damage().await.unwrap();
-        let Fixture { store, _dir: dir, .. } = f;
+        let Fixture { store, dir, .. } = f;
         store.close().await;
         drop(store);
         let store = Store::open(dir.path()).await.unwrap();

@@ -3,20 +3,21 @@
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, Sqlite, Transaction};
 
-use super::job_rows::insert_job;
+use super::job_rows::{insert_job, made};
 use super::rows::{json, parsed, to_json};
-use super::{Page, StorageError, Store};
+use super::{Page, Seal, StorageError, Store};
 use crate::project::{
     Decision, DecisionId, Job, JobId, JobKind, KeptDecision, Lane, ProjectId, ScanId, Timestamp,
 };
 
 impl Store {
     /// Keeps a decision. It replaces earlier ones about the two scans that it contradicts or repeats: a join every other one, a ban
-    /// every join. Returns it with the job that makes the model obey.
+    /// every join. Returns it with the job that makes the model obey. The answer to the request is kept with it.
     pub async fn decide(
         &self,
         project: ProjectId,
         decision: &Decision,
+        seal: Seal<'_, (KeptDecision, Job)>,
     ) -> Result<(KeptDecision, Job), StorageError> {
         let kept =
             KeptDecision { id: DecisionId::generate(), decision: *decision, created: Timestamp::now() };
@@ -56,8 +57,10 @@ impl Store {
         .bind(kept.created.0)
         .execute(&mut *tx)
         .await?;
-        let job = self.obey(tx, project).await?;
-        Ok((kept, job))
+        let done = (kept, obey(&mut tx, project).await?);
+        seal.set(&mut tx, &done).await?;
+        self.commit_with(tx, &done.1).await?;
+        Ok(done)
     }
 
     /// Takes a decision back. Returns the job that makes the model follow.
@@ -71,7 +74,9 @@ impl Store {
         if done.rows_affected() == 0 {
             return Err(StorageError::NoDecision(id));
         }
-        self.obey(tx, project).await
+        let job = obey(&mut tx, project).await?;
+        self.commit_with(tx, &job).await?;
+        Ok(job)
     }
 
     /// One decision.
@@ -107,18 +112,19 @@ impl Store {
     }
 
     /// Commits a change of decisions together with the job that makes the model obey.
-    async fn obey(
-        &self,
-        mut tx: Transaction<'static, Sqlite>,
-        project: ProjectId,
-    ) -> Result<Job, StorageError> {
-        let job = JobId::generate();
-        insert_job(&mut tx, job, project, None, JobKind::Decision, Lane::Map, Timestamp::now()).await?;
+    async fn commit_with(&self, tx: Transaction<'static, Sqlite>, job: &Job) -> Result<(), StorageError> {
         tx.commit().await?;
-        self.announce([job]);
+        self.announce([job.id]);
         self.ring();
-        self.job(job).await
+        Ok(())
     }
+}
+
+/// Adds the job that makes the model obey.
+async fn obey(tx: &mut Transaction<'static, Sqlite>, project: ProjectId) -> Result<Job, StorageError> {
+    let job = JobId::generate();
+    insert_job(tx, job, project, None, JobKind::Decision, Lane::Map, Timestamp::now()).await?;
+    made(tx, job).await
 }
 
 /// Fails unless the project holds the scan.
@@ -150,26 +156,18 @@ fn kept(row: &SqliteRow) -> Result<KeptDecision, StorageError> {
 mod tests {
     use super::*;
     use crate::geometry::Pose;
-    use crate::project::{ContentKey, Interpretation, JobState, Name, ProjectSettings, Verdict};
-    use crate::storage::{BlobId, NewScan};
+    use crate::project::{JobState, Verdict};
+    use crate::storage::testing::{new_scan, project};
+    use crate::storage::{BlobId, StoredBlob};
 
     async fn store() -> (Store, ProjectId, [ScanId; 3], tempfile::TempDir) {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).await.unwrap();
-        let name = Name::parse("test").unwrap();
-        let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
+        let project = project(&store).await;
         let mut scans = Vec::new();
         for content in 0..3_u8 {
-            let new = NewScan {
-                project,
-                key: ContentKey(content.into()),
-                name: name.clone(),
-                format: "ply".to_owned(),
-                blob: BlobId(blake3::hash(&[content])),
-                bytes: 1,
-                interpretation: Interpretation::default(),
-                sender: None,
-            };
+            let blob = StoredBlob { id: BlobId(blake3::hash(&[content])), bytes: 1 };
+            let new = new_scan(project, content.into(), blob);
             scans.push(store.admit_scan(&new).await.unwrap().scan.id);
         }
         (store, project, scans.try_into().unwrap(), dir)
@@ -187,7 +185,7 @@ mod tests {
         let ban = Verdict::Forbid { a_from_b: Some(there) };
         let never = Verdict::Forbid { a_from_b: None };
         let decide = async |scan_a, scan_b, verdict| {
-            store.decide(project, &Decision { scan_a, scan_b, verdict }).await.unwrap()
+            store.decide(project, &Decision { scan_a, scan_b, verdict }, Seal::none()).await.unwrap()
         };
         decide(a, c, join).await;
         for (scans, verdict, held) in [
@@ -210,15 +208,15 @@ mod tests {
         let (store, project, [a, b, c], _dir) = store().await;
         let decide =
             |scan_a, scan_b| Decision { scan_a, scan_b, verdict: Verdict::Forbid { a_from_b: None } };
-        let (first, _) = store.decide(project, &decide(a, b)).await.unwrap();
-        store.decide(project, &decide(b, c)).await.unwrap();
-        let (last, _) = store.decide(project, &decide(c, a)).await.unwrap();
+        let (first, _) = store.decide(project, &decide(a, b), Seal::none()).await.unwrap();
+        store.decide(project, &decide(b, c), Seal::none()).await.unwrap();
+        let (last, _) = store.decide(project, &decide(c, a), Seal::none()).await.unwrap();
         store.take_decision_back(project, first.id).await.unwrap();
         let again = store.take_decision_back(project, first.id).await;
         assert!(matches!(again, Err(StorageError::NoDecision(id)) if id == first.id));
         store.delete_scan(project, b).await.unwrap();
         assert_eq!(store.all_decisions(project).await.unwrap(), [last]);
-        let gone = store.decide(project, &decide(a, b)).await;
+        let gone = store.decide(project, &decide(a, b), Seal::none()).await;
         assert!(matches!(gone, Err(StorageError::NoScan(id)) if id == b));
     }
 
@@ -239,12 +237,12 @@ mod tests {
         }
         tx.commit().await.unwrap();
         let one_more = Decision { scan_a: a, scan_b: c, verdict: Verdict::Forbid { a_from_b: None } };
-        let refused = store.decide(project, &one_more).await;
+        let refused = store.decide(project, &one_more, Seal::none()).await;
         assert!(matches!(refused, Err(StorageError::TooManyDecisions { limit: KeptDecision::MOST, .. })));
         // A join of the two scans takes the place of all that.
         let a_from_b = Pose::identity();
         let join = Decision { scan_a: b, scan_b: a, verdict: Verdict::Join { a_from_b } };
-        store.decide(project, &join).await.unwrap();
+        store.decide(project, &join, Seal::none()).await.unwrap();
         assert_eq!(store.all_decisions(project).await.unwrap().len(), 1);
     }
 }

@@ -95,43 +95,14 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::project::{
-        ContentKey, Interpretation, JobKind, Lane, Name, ProjectId, ProjectSettings, Scan, VersionNumber,
-    };
-    use crate::storage::{Claim, FreshBlob, NewScan, NewVersion, Owner, Publication};
-
-    struct Fixture {
-        store: Store,
-        _dir: tempfile::TempDir,
-    }
+    use crate::project::{JobKind, Lane, ProjectId, Scan, VersionNumber};
+    use crate::storage::testing::{Fixture, new_scan, project};
+    use crate::storage::{Claim, NewVersion, Owner, Publication, Seal};
 
     impl Fixture {
-        async fn new() -> Self {
-            let dir = tempfile::tempdir().unwrap();
-            Self { store: Store::open(dir.path()).await.unwrap(), _dir: dir }
-        }
-
-        async fn project(&self) -> ProjectId {
-            let name = Name::parse("test").unwrap();
-            self.store.create_project(&name, &ProjectSettings::default()).await.unwrap().id
-        }
-
-        fn blob(&self, text: &str) -> FreshBlob {
-            self.store.blobs.put(text.as_bytes()).unwrap()
-        }
-
-        async fn scan(&self, project: ProjectId, text: &str) -> Scan {
+        async fn uploaded_to(&self, project: ProjectId, text: &str) -> Scan {
             let blob = self.blob(text);
-            let new = NewScan {
-                project,
-                key: ContentKey(u128::from(blob.bytes)),
-                name: Name::parse("scan").unwrap(),
-                format: "ply".to_owned(),
-                blob: blob.id,
-                bytes: blob.bytes,
-                interpretation: Interpretation::default(),
-                sender: None,
-            };
+            let new = new_scan(project, u128::from(blob.bytes), *blob);
             self.store.admit_scan(&new).await.unwrap().scan
         }
 
@@ -142,7 +113,7 @@ mod tests {
             texts.iter().map(there).collect()
         }
 
-        async fn claim(&self) -> Claim {
+        async fn mapping(&self) -> Claim {
             self.store.claim(Lane::Map, "worker", Duration::from_mins(1), 1, false).await.unwrap().unwrap()
         }
 
@@ -173,10 +144,10 @@ mod tests {
     #[tokio::test]
     async fn what_a_deleted_project_alone_needed_goes_and_the_rest_stays() {
         let f = Fixture::new().await;
-        let (doomed, other) = (f.project().await, f.project().await);
-        f.scan(doomed, "shared").await;
-        f.scan(other, "shared").await;
-        let scan = f.scan(doomed, "its own").await;
+        let (doomed, other) = (f.project, project(&f.store).await);
+        f.uploaded_to(doomed, "shared").await;
+        f.uploaded_to(other, "shared").await;
+        let scan = f.uploaded_to(doomed, "its own").await;
         let prepared = f.blob("prepared");
         let owner = Owner { project: doomed, scan: Some(scan.id) };
         f.store.remember(&blake3::hash(b"key"), owner, &prepared).await.unwrap();
@@ -190,11 +161,11 @@ mod tests {
     #[tokio::test]
     async fn an_upload_stays_until_the_model_holds_its_deleted_scan_no_more() {
         let f = Fixture::new().await;
-        let project = f.project().await;
-        let scan = f.scan(project, "upload").await;
+        let project = f.project;
+        let scan = f.uploaded_to(project, "upload").await;
         f.store.delete_scan(project, scan.id).await.unwrap();
         assert_eq!(f.left(&["upload"]).await, [true]);
-        let removal = f.claim().await;
+        let removal = f.mapping().await;
         assert_eq!(removal.job.kind, JobKind::Removal);
         f.publish(&removal, 0, None).await;
         assert_eq!(f.left(&["upload"]).await, [false]);
@@ -203,10 +174,10 @@ mod tests {
     #[tokio::test]
     async fn only_the_newest_version_keeps_the_state_of_the_engine() {
         let f = Fixture::new().await;
-        let project = f.project().await;
+        let project = f.project;
         for from in 0..2 {
-            f.store.create_job(project, JobKind::Rebuild, None).await.unwrap();
-            let claim = f.claim().await;
+            f.store.create_job(project, JobKind::Rebuild, None, Seal::none()).await.unwrap();
+            let claim = f.mapping().await;
             let blobs = [["state 1", "content 1"], ["state 2", "content 2"]][from as usize];
             f.publish(&claim, from, Some((blobs[0], blobs[1]))).await;
         }

@@ -5,7 +5,7 @@ use sqlx::{Row, Sqlite, Transaction};
 
 use super::quotas::Addition;
 use super::rows::{count, json, parsed, word};
-use super::{Page, StorageError, Store};
+use super::{Page, Seal, StorageError, Store};
 use crate::project::{Job, JobId, JobKind, JobState, KeyId, Lane, ProjectId, ScanId, Timestamp};
 
 /// Which jobs to list.
@@ -18,12 +18,13 @@ pub struct JobFilter {
 }
 
 impl Store {
-    /// Accepts a job on a project's model, asked for with a key.
+    /// Accepts a job on a project's model, asked for with a key, and keeps the answer to the request for it.
     pub async fn create_job(
         &self,
         project: ProjectId,
         kind: JobKind,
         key: Option<KeyId>,
+        seal: Seal<'_, Job>,
     ) -> Result<Job, StorageError> {
         let id = JobId::generate();
         let mut tx = self.begin().await?;
@@ -37,10 +38,12 @@ impl Store {
         self.check_quotas(&mut tx, project, key, Addition { jobs: 1, ..Addition::default() }).await?;
         insert_job(&mut tx, id, project, None, kind, Lane::Map, Timestamp::now()).await?;
         charge_job(&mut tx, id, key).await?;
+        let made = made(&mut tx, id).await?;
+        seal.set(&mut tx, &made).await?;
         tx.commit().await?;
         self.announce([id]);
         self.ring();
-        self.job(id).await
+        Ok(made)
     }
 
     /// One job.
@@ -132,6 +135,11 @@ pub(super) async fn insert_job(
     .execute(&mut **tx)
     .await?;
     Ok(())
+}
+
+/// A job as the transaction has made it.
+pub(super) async fn made(tx: &mut Transaction<'static, Sqlite>, id: JobId) -> Result<Job, StorageError> {
+    job(&sqlx::query("SELECT * FROM jobs WHERE id = ?").bind(id.to_string()).fetch_one(&mut **tx).await?)
 }
 
 /// Notes on whose account a job is.

@@ -211,6 +211,7 @@ mod tests {
 
     use super::*;
     use crate::project::ProjectSettings;
+    use crate::storage::Seal;
 
     fn new(reach: Reach) -> NewKey {
         let limits = Limits { bytes: Some(7), scans: None, queued_jobs: Some(2) };
@@ -222,8 +223,10 @@ mod tests {
     async fn a_key_made_beside_the_running_service_opens_it_at_once_and_revoked_it_does_not() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).await.unwrap();
-        let project =
-            store.create_project(&Name::parse("p").unwrap(), &ProjectSettings::default()).await.unwrap();
+        let project = store
+            .create_project(&Name::parse("p").unwrap(), &ProjectSettings::default(), Seal::none())
+            .await
+            .unwrap();
         let beside = Keys::open(dir.path()).await.unwrap();
         let token = Token::generate(KeyId::generate()).unwrap();
         let new = new(Reach::Projects(BTreeSet::from([project.id])));
@@ -251,7 +254,7 @@ mod tests {
 
         let store = Store::open(dir.path()).await.unwrap();
         let name = Name::parse("p").unwrap();
-        let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap();
+        let project = store.create_project(&name, &ProjectSettings::default(), Seal::none()).await.unwrap();
         let reach = Reach::Projects(BTreeSet::from([project.id]));
         store.keys().create(&new(reach), &token).await.unwrap();
         store.delete_project(project.id).await.unwrap();

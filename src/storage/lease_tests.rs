@@ -4,42 +4,19 @@ use std::time::Duration;
 
 use serde_json::json;
 
+use super::testing::{Fixture, new_scan, project};
 use super::{
-    Admission, BlobId, Claim, JobFilter, Measures, NewScan, Page, Publication, Retry, StorageError, Store,
+    Admission, BlobId, Claim, JobFilter, Measures, Page, Publication, Retry, Seal, StorageError, Store,
+    StoredBlob,
 };
-use crate::project::{
-    ContentKey, Fault, Interpretation, JobKind, JobState, Lane, Name, ProjectId, ProjectSettings, ScanState,
-    VersionNumber,
-};
+use crate::project::{Fault, JobKind, JobState, Lane, Name, ProjectSettings, ScanState, VersionNumber};
 
 const LONG: Duration = Duration::from_mins(10);
 
-struct Fixture {
-    store: Store,
-    project: ProjectId,
-    _dir: tempfile::TempDir,
-}
-
 impl Fixture {
-    async fn new() -> Self {
-        let dir = tempfile::tempdir().unwrap();
-        let store = Store::open(dir.path()).await.unwrap();
-        let name = Name::parse("test").unwrap();
-        let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
-        Self { store, project, _dir: dir }
-    }
-
     async fn scan(&self, content: u8) -> Admission {
-        let new = NewScan {
-            project: self.project,
-            key: ContentKey(content.into()),
-            name: Name::parse("scan").unwrap(),
-            format: "ply".to_owned(),
-            blob: BlobId(blake3::hash(&[content])),
-            bytes: 1,
-            interpretation: Interpretation::default(),
-            sender: None,
-        };
+        let blob = StoredBlob { id: BlobId(blake3::hash(&[content])), bytes: 1 };
+        let new = new_scan(self.project, content.into(), blob);
         self.store.admit_scan(&new).await.unwrap()
     }
 
@@ -194,7 +171,7 @@ async fn a_removal_comes_before_the_same_content_again_and_a_rebuild_after_all()
     let removal = f.store.delete_scan(f.project, scan.scan.id).await.unwrap();
     let again = f.ingested(1).await;
     assert!(!again.duplicate, "the deleted scan does not count");
-    let rebuild = f.store.create_job(f.project, JobKind::Rebuild, None).await.unwrap();
+    let rebuild = f.store.create_job(f.project, JobKind::Rebuild, None, Seal::none()).await.unwrap();
     let mut order = Vec::new();
     while let Some(claim) = f.claim(Lane::Map).await {
         order.push(claim.job.id);
@@ -242,7 +219,7 @@ async fn a_data_directory_serves_one_process_and_keeps_what_was_committed() {
     let store = Store::open(dir.path()).await.unwrap();
     assert!(matches!(Store::open(dir.path()).await, Err(StorageError::InUse)));
     let name = Name::parse("kept").unwrap();
-    let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap();
+    let project = store.create_project(&name, &ProjectSettings::default(), Seal::none()).await.unwrap();
     store.close().await;
     drop(store);
     let store = Store::open(dir.path()).await.unwrap();
@@ -274,9 +251,8 @@ async fn a_project_of_many_scans_does_not_keep_another_waiting() {
     for content in 0..50 {
         f.scan(content).await;
     }
-    let name = Name::parse("small").unwrap();
-    let small = f.store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
-    let other = Fixture { store: f.store.clone(), project: small, _dir: tempfile::tempdir().unwrap() };
+    let small = project(&f.store).await;
+    let other = Fixture { store: f.store.clone(), project: small, dir: tempfile::tempdir().unwrap() };
     let single = other.scan(100).await;
     let first = f.claim(Lane::Ingest).await.unwrap();
     assert_eq!(first.job.project, f.project);

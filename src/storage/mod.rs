@@ -33,6 +33,8 @@ mod rows;
 mod scans;
 mod setbacks;
 mod store;
+#[cfg(test)]
+pub(crate) mod testing;
 mod thinning;
 mod upload_files;
 mod uploads;
@@ -49,7 +51,7 @@ pub use derived::Owner;
 pub use error::{StorageError, Trouble};
 pub use figures::{EndedJob, Figures};
 pub use hold::Hold;
-pub use idempotency::KeptAnswer;
+pub use idempotency::{Answer, KeptAnswer, Receipt, Seal};
 pub use job_rows::JobFilter;
 pub use keys::{Keys, NewKey};
 pub use ledger::Finding;

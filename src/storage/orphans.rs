@@ -93,15 +93,14 @@ pub(super) fn files(root: &Path) -> io::Result<Vec<DirEntry>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::project::{Name, ProjectSettings};
+    use crate::storage::testing::project;
     use crate::storage::{Hold, Owner};
 
     #[tokio::test]
     async fn what_a_crash_left_without_a_row_is_found_at_the_next_start_and_nothing_else() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).await.unwrap();
-        let name = Name::parse("test").unwrap();
-        let project = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
+        let project = project(&store).await;
         let needed = store.blobs.put(b"needed").unwrap();
         store.remember(&blake3::hash(b"key"), Owner { project, scan: None }, &needed).await.unwrap();
         let orphan = store.blobs.put(b"its row never came").unwrap().id;

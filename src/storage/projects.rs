@@ -4,18 +4,19 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::rows::{count, parsed, word};
-use super::{Page, StorageError, Store};
+use super::{Page, Seal, StorageError, Store};
 use crate::control::Seed;
 use crate::project::{KeyId, Name, Project, ProjectId, ProjectSettings, Timestamp, VersionNumber};
 
 const SELECT: &str = "SELECT p.rowid AS position, p.*, (SELECT COUNT(*) FROM scans s WHERE s.project_id = p.id AND s.deleted_ms IS NULL) AS scans FROM projects p ";
 
 impl Store {
-    /// Makes a project.
+    /// Makes a project, and keeps the answer to the request for it.
     pub async fn create_project(
         &self,
         name: &Name,
         settings: &ProjectSettings,
+        seal: Seal<'_, Project>,
     ) -> Result<Project, StorageError> {
         let id = ProjectId::generate();
         let created = Timestamp::now();
@@ -28,15 +29,11 @@ impl Store {
             .bind(created.0)
             .execute(&mut *tx)
             .await?;
+        let (name, settings) = (name.clone(), *settings);
+        let made = Project { id, name, settings, head: VersionNumber::EMPTY, created, scans: 0 };
+        seal.set(&mut tx, &made).await?;
         tx.commit().await?;
-        Ok(Project {
-            id,
-            name: name.clone(),
-            settings: *settings,
-            head: VersionNumber::EMPTY,
-            created,
-            scans: 0,
-        })
+        Ok(made)
     }
 
     /// One project.

@@ -74,7 +74,7 @@ impl Store {
         UploadFiles::open(&data.join("uploads"))?;
         let options = options(data).create_if_missing(true);
         // One writer: SQLite allows no more, and a queue here is fairer than its lock.
-        let write = SqlitePoolOptions::new().max_connections(1).connect_with(writing(&options)).await?;
+        let write = connections(1).connect_with(writing(&options)).await?;
         MIGRATOR.run(&write).await?;
         // The names of the database and of the folder of blobs must survive a power cut as well as what is in them.
         File::open(data)
@@ -108,7 +108,7 @@ impl Store {
             return Err(StorageError::NoData(data.to_owned()));
         }
         let options = options(data);
-        let write = SqlitePoolOptions::new().max_connections(1).connect_lazy_with(writing(&options));
+        let write = connections(1).connect_lazy_with(writing(&options));
         let blobs = BlobStore::beside(&data.join("blobs"));
         let store = Self::assemble(data, options, write, blobs, DataClaim::Beside { _hold: hold }).await?;
         let found: Vec<i64> =
@@ -130,8 +130,7 @@ impl Store {
         blobs: BlobStore,
         claim: DataClaim,
     ) -> Result<Self, StorageError> {
-        let read =
-            SqlitePoolOptions::new().max_connections(READERS).connect_with(options.read_only(true)).await?;
+        let read = connections(READERS).connect_with(options.read_only(true)).await?;
         let bells = Bells {
             project_limits: OnceLock::new(),
             changed: broadcast::Sender::new(CHANGES),
@@ -206,6 +205,16 @@ impl Store {
         self.read.close().await;
         self.write.close().await;
     }
+}
+
+/// At most so many connections, which stay open. Each has a thread, and asking that first whether its file is still there would double the
+/// time that a short query takes.
+fn connections(most: u32) -> SqlitePoolOptions {
+    SqlitePoolOptions::new()
+        .max_connections(most)
+        .test_before_acquire(false)
+        .idle_timeout(None)
+        .max_lifetime(None)
 }
 
 fn options(data: &Path) -> SqliteConnectOptions {

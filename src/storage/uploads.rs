@@ -7,15 +7,20 @@ use sqlx::sqlite::SqliteRow;
 
 use super::rows::{count, json, parsed, to_json, word};
 use super::upload_files::blocking;
-use super::{Admission, FreshBlob, NewScan, StorageError, Store, StoredBlob};
+use super::{Admission, FreshBlob, NewScan, Seal, StorageError, Store, StoredBlob};
 use crate::project::{KeyId, Name, NewUpload, ProjectId, ScanId, Timestamp, Upload, UploadEnd, UploadId};
 
 /// How long after its expiry an upload is remembered, so that its client is told what happened to it.
 const REMEMBERED: Duration = Duration::from_hours(24);
 
 impl Store {
-    /// Notes an upload that was announced. It expires at `expires` unless something comes.
-    pub async fn create_upload(&self, new: NewUpload, expires: Timestamp) -> Result<Upload, StorageError> {
+    /// Notes an upload that was announced, and keeps the answer to the announcement. It expires at `expires` unless something comes.
+    pub async fn create_upload(
+        &self,
+        new: NewUpload,
+        expires: Timestamp,
+        seal: Seal<'_, Upload>,
+    ) -> Result<Upload, StorageError> {
         let (id, created) = (UploadId::generate(), Timestamp::now());
         let mut tx = self.begin().await?;
         let known = sqlx::query("SELECT 1 FROM projects WHERE id = ?").bind(new.project.to_string());
@@ -38,8 +43,10 @@ impl Store {
         .bind(new.sender.map(|key| key.to_string()))
         .execute(&mut *tx)
         .await?;
+        let made = Upload { id, announced: new, received: 0, blob: None, end: None, created, expires };
+        seal.set(&mut tx, &made).await?;
         tx.commit().await?;
-        Ok(Upload { id, announced: new, received: 0, blob: None, end: None, created, expires })
+        Ok(made)
     }
 
     /// One upload, expired or not.
@@ -195,15 +202,16 @@ fn upload(row: &SqliteRow) -> Result<Upload, StorageError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::project::{Interpretation, ProjectSettings};
+    use crate::project::Interpretation;
+    use crate::storage::testing::project;
 
     #[tokio::test]
     async fn what_expired_or_was_deleted_leaves_no_bytes_and_at_last_no_row() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).await.unwrap();
         let name = Name::parse("test").unwrap();
-        let doomed = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
-        let other = store.create_project(&name, &ProjectSettings::default()).await.unwrap().id;
+        let doomed = project(&store).await;
+        let other = project(&store).await;
         let new = |project| NewUpload {
             project,
             name: name.clone(),
@@ -214,9 +222,9 @@ mod tests {
         };
         let now = Timestamp::now();
         let (soon, late) = (now.plus(Duration::from_secs(1)), now.plus(Duration::from_hours(1)));
-        let orphan = store.create_upload(new(doomed), late).await.unwrap().id;
-        let expired = store.create_upload(new(other), soon).await.unwrap().id;
-        let alive = store.create_upload(new(other), late).await.unwrap().id;
+        let orphan = store.create_upload(new(doomed), late, Seal::none()).await.unwrap().id;
+        let expired = store.create_upload(new(other), soon, Seal::none()).await.unwrap().id;
+        let alive = store.create_upload(new(other), late, Seal::none()).await.unwrap().id;
         for id in [orphan, expired, alive] {
             let mut file = store.uploads.at(id, 0).await.unwrap();
             file.write(b"12345").await.unwrap();

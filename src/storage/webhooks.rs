@@ -7,7 +7,7 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::rows::{count, parsed, word};
-use super::{Page, StorageError, Store};
+use super::{Page, Seal, StorageError, Store};
 use crate::project::{Delivery, DeliveryState, ProjectId, SigningSecret, Timestamp, Webhook, WebhookId};
 
 /// A message that is to be sent now.
@@ -44,6 +44,7 @@ impl Store {
         project: ProjectId,
         url: &str,
         secret: &SigningSecret,
+        seal: Seal<'_, Webhook>,
     ) -> Result<Webhook, StorageError> {
         let (id, created) = (WebhookId::generate(), Timestamp::now());
         let mut tx = self.begin().await?;
@@ -65,8 +66,10 @@ impl Store {
             .bind(created.0)
             .execute(&mut *tx)
             .await?;
+        let made = Webhook { id, project, url: url.to_owned(), created };
+        seal.set(&mut tx, &made).await?;
         tx.commit().await?;
-        Ok(Webhook { id, project, url: url.to_owned(), created })
+        Ok(made)
     }
 
     /// The webhooks of a project, oldest first.

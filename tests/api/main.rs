@@ -13,6 +13,8 @@ mod lifecycle;
 mod limits;
 mod metrics;
 mod restore;
+#[path = "../shared/room.rs"]
+mod room;
 mod server;
 mod tus;
 mod tus_clients;

@@ -7,13 +7,13 @@ use reqwest::StatusCode;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{Connection as _, SqliteConnection};
 
-use crate::process::{Faults, Process, check, room, speck};
+use crate::process::{Faults, Process, check, room, speck, until};
 
 #[tokio::test]
 async fn a_full_disk_refuses_uploads_and_works_again_when_there_is_space() {
     let dir = tempfile::tempdir().unwrap();
     let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
-    let mut service = Process::with(&data, &[], Some(&faults));
+    let mut service = Process::with(&data, &["--poll-seconds", "1"], Some(&faults));
     let project = service.project().await;
     let first = service.accepted(&project, room(0.0)).await;
     faults.set("write enospc 0 /data/");
@@ -24,8 +24,9 @@ async fn a_full_disk_refuses_uploads_and_works_again_when_there_is_space() {
     }
     let scans = service.json(&format!("{project}/scans")).await;
     assert_eq!(scans["items"].as_array().unwrap().len(), 1, "readers are served, and nothing half is there");
-    // Longer than all attempts of a job that is to blame itself.
-    tokio::time::sleep(std::time::Duration::from_secs(5)).await;
+    // More often than all attempts of a job that is to blame itself.
+    let before = faults.struck();
+    until("workers try again and again", || faults.struck() >= before + 40).await;
     assert!(!service.has_died());
     faults.set("");
     let second = service.accepted(&project, room(0.4)).await;

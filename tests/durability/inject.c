@@ -3,7 +3,9 @@
  * The file that CAIRN_INJECT names holds the rules and is read at every call, so that a test changes them while the service runs. A line
  * is "CALL ACTION SKIP PATH": calls of that kind on files whose path contains PATH, after SKIP of them were let pass.
  *   CALL    write, sync, open, rename
- *   ACTION  enospc, eio: the call fails with this error; short: a write writes half; abort, loop: so does the process
+ *   ACTION  enospc, eio: the call fails with this error; short: a write writes half; abort, loop: so does the process; gorge: the
+ *           process takes ever more memory
+ * Every call that a rule strikes adds a byte to the file that is named like the rules and ".struck".
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -21,6 +23,25 @@
 enum { PASS, FAIL, HALF };
 static atomic_long passed;
 static atomic_ulong current;
+
+static void note(const char *control) {
+    char path[4096];
+    if (snprintf(path, sizeof path, "%s.struck", control) >= (int)sizeof path) return;
+    int fd = syscall(SYS_openat, AT_FDCWD, path, O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0644);
+    if (fd < 0) return;
+    syscall(SYS_write, fd, ".", 1);
+    syscall(SYS_close, fd);
+}
+
+static void gorge(void) {
+    const size_t piece = 16 << 20;
+    for (;;) {
+        void *more = malloc(piece);
+        if (!more) abort();
+        memset(more, 1, piece);
+        usleep(20000);
+    }
+}
 
 static int judge(const char *call, const char *path) {
     const char *control = getenv("CAIRN_INJECT");
@@ -42,9 +63,11 @@ static int judge(const char *call, const char *path) {
         if (sscanf(line, "%15s %15s %ld %1023s", kind, action, &skip, part) != 4) continue;
         if (strcmp(kind, call) || !strstr(path, part)) continue;
         if (atomic_fetch_add(&passed, 1) < skip) continue;
+        note(control);
         if (!strcmp(action, "short")) return HALF;
         if (!strcmp(action, "abort")) abort();
         if (!strcmp(action, "loop")) for (;;) usleep(1000);
+        if (!strcmp(action, "gorge")) gorge();
         errno = !strcmp(action, "enospc") ? ENOSPC : EIO;
         return FAIL;
     }

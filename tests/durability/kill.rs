@@ -1,46 +1,18 @@
 //! `kill -9` at random moments: two rigs upload, jobs run, versions are published, decisions are posted, and readers watch. `CAIRN_KILLS`
 //! says how often (10 if it does not).
 
-use std::io::Cursor;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use cairn::cloud::PlyWriter;
 use cairn::control::Seed;
 use cairn::geometry::Pose;
-use cairn::simulate::{BuildingOptions, Sensor, SurveyOptions, simulate};
 use rand::RngExt;
 use reqwest::Client;
 use serde_json::{Value, json};
 use tokio::task::JoinHandle;
 
 use crate::process::{Process, check};
-
-/// A file to upload, and where its scan truly is.
-struct Subject {
-    name: String,
-    file: Vec<u8>,
-    truth: Pose,
-}
-
-fn subjects() -> Vec<Subject> {
-    let options = SurveyOptions {
-        building: BuildingOptions { rooms: 2, ..BuildingOptions::default() },
-        sensor: Sensor::panoramic(30_000),
-        stations: 8,
-        seed: Seed(5),
-        ..SurveyOptions::default()
-    };
-    let survey = simulate(&options).unwrap();
-    let subject = |scan: &cairn::simulate::SimulatedScan| {
-        let mut file = Cursor::new(Vec::new());
-        let mut ply = PlyWriter::new(&mut file, false, &[]).unwrap();
-        scan.cloud.points.iter().for_each(|p| ply.point(*p).unwrap());
-        ply.finish().unwrap();
-        Subject { name: format!("{}.ply", scan.name), file: file.into_inner(), truth: scan.model_from_scan }
-    };
-    survey.scans.iter().map(subject).collect()
-}
+use crate::subjects::{Subject, subjects};
 
 /// What clients know of a service that lives and dies: where it is just now, and where on it they are at work.
 struct World {
@@ -217,7 +189,7 @@ impl Round {
 #[tokio::test(flavor = "multi_thread")]
 async fn kills_lose_nothing_that_was_acknowledged_and_leave_as_good_a_model() {
     let kills: u32 = std::env::var("CAIRN_KILLS").map_or(10, |n| n.parse().unwrap());
-    let subjects = Arc::new(subjects());
+    let subjects = Arc::new(subjects(2, 8));
     let data = tempfile::tempdir().unwrap();
     let mut rng = Seed(11).derive("kills", 0);
     let mut service = Process::start(data.path());

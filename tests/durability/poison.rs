@@ -55,30 +55,32 @@ async fn a_scan_that_kills_the_mapper_is_found_out_and_the_others_are_mapped() {
     for shift in [0.0, 7.0, 0.4] {
         uploads.push(service.accepted(&project, room(shift)).await);
     }
-    let mut deaths = 0;
-    let begun = std::time::Instant::now();
-    let ended = loop {
-        assert!(begun.elapsed().as_secs() < 100, "the jobs do not end");
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-        if service.has_died() {
-            deaths += 1;
-            service = Process::with(&data, &[], Some(&faults));
-        }
-        let mut jobs = Vec::new();
-        for upload in &uploads {
-            let at = format!("{}/v1/jobs/{}", service.url, upload["job"]["id"].as_str().unwrap());
-            if let Ok(answer) = reqwest::get(at).await
-                && let Ok(job) = answer.json::<Value>().await
-                && !job["finished"].is_null()
-            {
-                jobs.push(job);
-            }
-        }
-        if jobs.len() == uploads.len() {
-            break jobs;
-        }
-    };
-    assert!(deaths <= 2, "after that it had a process of its own: {deaths}");
+    let mut ended = Vec::new();
+    for upload in &uploads {
+        ended.push(service.ended(&upload["job"]).await);
+    }
+    assert!(!service.has_died(), "it was a process of jobs that died");
     failed(&ended[1], "worker-lost");
     assert_eq!((&ended[0]["status"], &ended[2]["status"]), (&"succeeded".into(), &"succeeded".into()));
+}
+
+#[tokio::test]
+async fn a_job_that_takes_ever_more_memory_fails_and_nobody_else_does() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let little = (300_u64 << 20).to_string();
+    let mut service = Process::with(&data, &["--worker-memory-bytes", &little], Some(&faults));
+    let project = service.project().await;
+    let greedy = room(7.0);
+    faults.set(&format!("open gorge 0 {}", blake3::hash(&greedy).to_hex()));
+    let greedy = service.accepted(&project, greedy).await;
+    let mut good = Vec::new();
+    for shift in [0.0, 0.4] {
+        good.push(service.accepted(&project, room(shift)).await);
+    }
+    for upload in &good {
+        assert_eq!(service.ended(&upload["job"]).await["status"], "succeeded");
+    }
+    failed(&service.ended(&greedy["job"]).await, "memory-limit");
+    assert!(!service.has_died());
 }

@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 use reqwest::{Client, Response, StatusCode};
 use serde_json::{Value, json};
 
+pub use crate::room::room;
+
 /// The program that is tested.
 fn program() -> PathBuf {
     std::env::var_os("CARGO_BIN_EXE_cairn").map_or_else(|| env!("CARGO_BIN_EXE_cairn").into(), PathBuf::from)
@@ -112,6 +114,15 @@ impl Drop for Process {
     }
 }
 
+/// Waits for something that will be so.
+pub async fn until(what: &str, is_so: impl Fn() -> bool) {
+    let begun = Instant::now();
+    while !is_so() {
+        assert!(begun.elapsed() < Duration::from_mins(2), "it does not come about that {what}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
 /// The rules by which calls fail; see `inject.c`.
 pub struct Faults(PathBuf);
 
@@ -129,6 +140,11 @@ impl Faults {
         let new = self.0.with_extension("new");
         fs::write(&new, rules).unwrap();
         fs::rename(new, &self.0).unwrap();
+    }
+
+    /// How many calls the rules have struck so far.
+    pub fn struck(&self) -> u64 {
+        fs::metadata(self.0.with_extension("struck")).map_or(0, |file| file.len())
     }
 }
 
@@ -169,34 +185,6 @@ pub fn speck(seed: usize) -> Vec<u8> {
     let points: Vec<String> = (0..9).map(|i| format!("{} {} 1\n", i + seed, i * i)).collect();
     let points = points.concat();
     format!("ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nproperty float y\nproperty float z\nend_header\n{points}")
-        .into_bytes()
-}
-
-/// A corner of a furnished room, seen from a place that `shift` (metres) moves: different shifts are overlapping, different scans.
-pub fn room(shift: f64) -> Vec<u8> {
-    let mut points: Vec<[f64; 3]> = Vec::new();
-    let mut patch = |corner: [f64; 3], u: [f64; 3], v: [f64; 3]| {
-        for i in 0..40 {
-            for j in 0..40 {
-                let (a, b) = (f64::from(i) / 40.0, f64::from(j) / 40.0);
-                points.push(std::array::from_fn(|k| corner[k] + a * u[k] + b * v[k]));
-            }
-        }
-    };
-    patch([0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]);
-    patch([0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 0.0, 2.5]);
-    patch([0.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 2.5]);
-    for [x, y, size] in [[1.0, 1.2, 0.5], [2.7, 0.9, 0.8], [1.9, 2.8, 0.35], [3.2, 3.1, 0.6]] {
-        patch([x, y, size], [size, 0.0, 0.0], [0.0, size * 1.3, 0.0]);
-        patch([x, y, 0.0], [size, 0.0, 0.0], [0.0, 0.0, size]);
-        patch([x, y, 0.0], [0.0, size * 1.3, 0.0], [0.0, 0.0, size]);
-    }
-    let points: Vec<String> = points
-        .iter()
-        .map(|[x, y, z]| format!("{:.4} {:.4} {:.4}\n", x - 2.0 - shift, y - 2.0 + 0.3 * shift, z - 1.3))
-        .collect();
-    let (n, points) = (points.len(), points.concat());
-    format!("ply\nformat ascii 1.0\nelement vertex {n}\nproperty float x\nproperty float y\nproperty float z\nend_header\n{points}")
         .into_bytes()
 }
 

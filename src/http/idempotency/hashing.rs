@@ -42,6 +42,7 @@ struct Seen {
 }
 
 /// The hash of a body that somebody else reads.
+#[derive(Clone)]
 pub(super) struct HashOf(Arc<Mutex<Seen>>);
 
 impl HashOf {

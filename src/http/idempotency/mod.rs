@@ -2,12 +2,14 @@
 //!
 //! The layer hashes the request while the handler reads it, and keeps the answer under the key for a day. A key that
 //! comes with another request is refused (422), one whose first request still runs as well (409). Not kept are failures
-//! of the service, refusals for want of room, and answers that were given before the whole request was read: then trying again is right. Uses
-//! [`crate::storage::KeptAnswer`].
+//! of the service, refusals for want of room, and answers that were given before the whole request was read: then trying again is right.
+//! A handler that changes rows has the answer kept in the same transaction ([`Once`]), so that no death of the process comes
+//! between the two; uploads know their content again instead. Uses [`crate::storage::KeptAnswer`].
 
 mod description;
 mod hashing;
 mod key;
+mod once;
 mod running;
 
 use std::time::Duration;
@@ -23,11 +25,13 @@ use tracing::Instrument;
 use super::problem::Problem;
 use super::router::Api;
 use crate::project::Timestamp;
-use crate::storage::KeptAnswer;
+use crate::storage::Answer;
 
 pub(super) use description::describe;
 use hashing::{Hashing, of_head};
 use key::key;
+use once::receipt;
+pub(super) use once::{Once, Reply};
 pub(super) use running::Running;
 
 /// How long answers are kept.
@@ -80,7 +84,7 @@ async fn once(
     if let Some(kept) = api.store.kept_answer(scope, key, Timestamp::now()).await? {
         let found = of_body(api, hasher, request.into_body()).await?;
         return if found == kept.request {
-            replay(kept)
+            replay(kept.answer)
         } else {
             Err(Problem {
                 field: Some(key::FIELD.to_owned()),
@@ -92,11 +96,16 @@ async fn once(
             })
         };
     }
-    let (parts, body) = request.into_parts();
+    let (mut parts, body) = request.into_parts();
     let (body, hash) = Hashing::new(hasher, body);
+    let ticket = Once::new(scope, key, hash.clone());
+    parts.extensions.insert(ticket.clone());
     let answer = next.run(Request::from_parts(parts, Body::new(body))).await;
     let Some(request) = hash.whole() else { return Ok(answer) };
     if answer.status().is_server_error() || answer.status() == StatusCode::TOO_MANY_REQUESTS {
+        return Ok(answer);
+    }
+    if ticket.is_sealed() && answer.status().is_success() {
         return Ok(answer);
     }
     keep(api, scope, key, request, answer).await
@@ -115,22 +124,26 @@ async fn keep(
     let text = |(name, value): (&HeaderName, &HeaderValue)| {
         Some((name.as_str().to_owned(), value.to_str().ok()?.to_owned()))
     };
-    let kept = KeptAnswer {
-        request,
+    let kept = Answer {
         status: parts.status.as_u16(),
         headers: parts.headers.iter().filter_map(text).collect(),
         body: body.to_vec(),
     };
-    let expires = Timestamp::now().plus(KEPT);
-    if let Err(error) = api.store.keep_answer(scope, key, &kept, expires).await {
+    if let Err(error) = api.store.keep_answer(&receipt(scope, key, request), &kept).await {
         // What was asked for is done, so the client is told so.
         tracing::error!(%error, "an answer could not be kept for its key");
     }
     Ok(Response::from_parts(parts, Body::from(body)))
 }
 
-/// The answer that was kept.
-fn replay(kept: KeptAnswer) -> Result<Response, Problem> {
+/// The answer that was kept, given again.
+fn replay(kept: Answer) -> Result<Response, Problem> {
+    let mut answer = given(kept)?;
+    answer.headers_mut().insert(REPLAYED, HeaderValue::from_static("true"));
+    Ok(answer)
+}
+
+fn given(kept: Answer) -> Result<Response, Problem> {
     let status = StatusCode::from_u16(kept.status).map_err(Problem::internal)?;
     let mut answer = (status, kept.body).into_response();
     answer.headers_mut().clear();
@@ -138,7 +151,6 @@ fn replay(kept: KeptAnswer) -> Result<Response, Problem> {
         let name = HeaderName::from_bytes(name.as_bytes()).map_err(Problem::internal)?;
         answer.headers_mut().append(name, HeaderValue::from_str(&value).map_err(Problem::internal)?);
     }
-    answer.headers_mut().insert(REPLAYED, HeaderValue::from_static("true"));
     Ok(answer)
 }
 

@@ -2,19 +2,21 @@
 
 use axum::body::{Body, HttpBody};
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 
 use super::append::{count, detached};
 use super::headers::{BYTES, brings_bytes, bytes, continuation, standing, text};
 use super::metadata::parse_metadata;
-use super::version::Tus;
+use super::version::{RESUMABLE, Tus, VERSION};
 use crate::http::access::Caller;
 use crate::http::download::Bytes;
+use crate::http::idempotency::{Once, Reply};
 use crate::http::problem::{Problem, Problems};
 use crate::http::query::Params;
 use crate::http::router::Api;
 use crate::project::{NewUpload, Scope, Upload};
+use crate::storage::Seal;
 
 /// Announces an upload that will come in several requests (tus: creation, creation-with-upload). The metadata are the
 /// parameters of a direct upload and `project`. When the last byte has come, the upload is a scan like any other: the
@@ -45,6 +47,7 @@ pub(super) async fn create_upload(
     _: Tus,
     State(api): State<Api>,
     caller: Caller,
+    once: Once,
     query: Params,
     headers: HeaderMap,
     body: Body,
@@ -59,21 +62,30 @@ pub(super) async fn create_upload(
         return Err(wrong_type());
     }
     let request = continuation(&headers, 0)?;
-    let upload = api
-        .resumable
-        .create(NewUpload {
-            project: parsed.project,
-            name: parsed.name,
-            interpretation: parsed.interpretation,
-            metadata: metadata.to_owned(),
-            length,
-            sender: caller.key(),
-        })
-        .await?;
+    let new = NewUpload {
+        project: parsed.project,
+        name: parsed.name,
+        interpretation: parsed.interpretation,
+        metadata: metadata.to_owned(),
+        length,
+        sender: caller.key(),
+    };
+    // With bytes, the answer is known only when they have come.
+    let seal = if with_bytes { Seal::none() } else { once.seal(announced) };
+    let upload = api.resumable.create(new, seal).await?;
     let upload = if with_bytes { first_bytes(&api, upload, request, body).await? } else { upload };
     count(&api.metrics, &upload);
-    let location = [(header::LOCATION, format!("/v1/uploads/{}", upload.id))];
-    Ok((StatusCode::CREATED, location, standing(&upload)?).into_response())
+    Ok(announced(&upload)?.into_response())
+}
+
+/// The answer to an announcement.
+fn announced(upload: &Upload) -> Result<Reply, Problem> {
+    let mut headers = standing(upload)?;
+    headers.insert(RESUMABLE, HeaderValue::from_static(VERSION));
+    let location = format!("/v1/uploads/{}", upload.id);
+    let told: Vec<_> =
+        headers.iter().filter_map(|(name, value)| Some((name.clone(), value.to_str().ok()?))).collect();
+    Ok(Reply::made(StatusCode::CREATED, location, &told))
 }
 
 /// Takes the bytes in that came with the announcement.

@@ -8,9 +8,9 @@ use axum::response::{IntoResponse, Response};
 use crate::http::Problem;
 use crate::http::router::Api;
 
-const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
+pub(super) const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const VERSIONS: HeaderName = HeaderName::from_static("tus-version");
-const VERSION: &str = "1.0.0";
+pub(super) const VERSION: &str = "1.0.0";
 const EXTENSIONS: &str = "creation,creation-with-upload,checksum,expiration,termination";
 const ALGORITHMS: &str = "sha1,sha256,sha512";
 
