@@ -6,11 +6,12 @@ use std::sync::Arc;
 
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
-use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::Config;
-use crate::http::{self, Access, Api, ConnectionLimits, Openness, TlsError, acceptor, openapi_yaml, router};
+use crate::http::{
+    self, Access, Api, Certificates, Entrance, Openness, Rates, TlsError, openapi_yaml, router,
+};
 use crate::jobs::webhooks::{Courier, SendError};
 use crate::jobs::{Compute, Exports, Intake, Resumable, Workers};
 use crate::storage::{StorageError, Store};
@@ -88,7 +89,7 @@ const DRAIN: std::time::Duration = std::time::Duration::from_secs(10);
 pub async fn start(config: Config) -> Result<Running, StartError> {
     let store =
         Store::open(&config.data).await.map_err(|error| StartError::Data(config.data.clone(), error))?;
-    let tls = config.tls.as_ref().map(|(certificate, key)| acceptor(certificate, key)).transpose()?;
+    let tls = config.tls.as_ref().map(|(chain, key)| Certificates::open(chain, key)).transpose()?;
     store.limit_projects(config.project_limits);
     let openness = Openness::of(config.allow_anonymous, config.listen);
     if openness == Openness::Closed
@@ -102,15 +103,26 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         TcpListener::bind(config.listen).await.map_err(|error| StartError::Listen(config.listen, error))?;
     let addr = listener.local_addr().map_err(|error| StartError::Listen(config.listen, error))?;
     let stop = CancellationToken::new();
-    let intake = Intake::new(store.clone(), config.max_upload_bytes, config.upload_idle);
+    let intake = Intake::new(store.clone(), config.intake);
+    let metrics = Arc::default();
     let api = Api {
         store: store.clone(),
         resumable: Resumable::new(store.clone(), intake.clone(), config.upload_expiry, stop.clone()),
         intake,
-        exports: Exports::new(store.clone(), compute.clone(), config.workers.max_points),
-        access: Access { openness, origins: config.origins.into(), load: config.load },
+        exports: Exports::new(
+            store.clone(),
+            compute.clone(),
+            config.workers.max_points,
+            config.load.free_bytes,
+        ),
+        access: Access {
+            openness,
+            origins: config.origins.into(),
+            load: config.load,
+            rates: Rates::new(config.rates, config.proxies.clone()),
+        },
         webhooks: Arc::new(config.webhooks.targets.clone()),
-        metrics: Arc::default(),
+        metrics: Arc::clone(&metrics),
         readiness: Arc::default(),
         stop: stop.clone(),
         openapi: Arc::from(openapi_yaml().map_err(|problem| StartError::Description(problem.detail))?),
@@ -121,16 +133,9 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
     tracing::info!(%addr, data = %config.data.display(), "listening");
     let courier = Courier::new(store.clone(), config.webhooks)?;
     let scheme = if tls.is_some() { "https" } else { "http" };
-    let entrance = Entrance { listener, limits: config.connections, tls };
+    let entrance = Entrance { listener, limits: config.connections, proxies: config.proxies, tls, metrics };
     let server = tokio::spawn(serve(entrance, api, workers, courier, store, stop.clone()));
     Ok(Running { addr, scheme, stop, server })
-}
-
-/// Where requests come in.
-struct Entrance {
-    listener: TcpListener,
-    limits: ConnectionLimits,
-    tls: Option<TlsAcceptor>,
 }
 
 async fn serve(
@@ -142,8 +147,7 @@ async fn serve(
     stop: CancellationToken,
 ) {
     let courier = tokio::spawn(courier.run(stop.clone()));
-    let Entrance { listener, limits, tls } = entrance;
-    let graceful = http::serve(listener, router(api), limits, tls, stop.clone());
+    let graceful = http::serve(entrance, router(api), stop.clone());
     let overdue = async {
         stop.cancelled().await;
         tokio::time::sleep(DRAIN).await;

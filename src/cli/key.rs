@@ -69,6 +69,9 @@ pub struct CreateArgs {
     /// Most of its jobs that may be waiting or running at once [default: no limit]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub max_queued_jobs: Option<u64>,
+    /// Most of its resumable uploads that may be begun and not complete [default: no limit of its own]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    pub max_open_uploads: Option<u64>,
 }
 
 fn scope(word: &str) -> Result<Scope, String> {
@@ -126,7 +129,12 @@ async fn create(keys: &Keys, args: CreateArgs) -> anyhow::Result<()> {
         } else {
             Reach::Projects(args.projects.into_iter().collect())
         },
-        limits: Limits { bytes: args.max_bytes, scans: args.max_scans, queued_jobs: args.max_queued_jobs },
+        limits: Limits {
+            bytes: args.max_bytes,
+            scans: args.max_scans,
+            queued_jobs: args.max_queued_jobs,
+            open_uploads: args.max_open_uploads,
+        },
         expires: args.expires_in_days.map(|n| Timestamp::now().plus(days(n))),
     };
     let token = Token::generate(KeyId::generate())?;
@@ -155,7 +163,8 @@ fn in_words(key: &Key) -> String {
     let limit = |what, most: Option<u64>| most.map(|n| format!(", at most {n} {what}")).unwrap_or_default();
     let limits = limit("bytes", key.limits.bytes)
         + &limit("scans", key.limits.scans)
-        + &limit("queued jobs", key.limits.queued_jobs);
+        + &limit("queued jobs", key.limits.queued_jobs)
+        + &limit("open uploads", key.limits.open_uploads);
     let (id, scope, state, name) = (key.id, key.scope.as_str(), state(key), &key.name);
     format!("{id}  {state:<7}  {scope:<6}  {name}: {reach}; expires {until}{limits}")
 }
@@ -168,6 +177,7 @@ fn in_json(key: &Key) -> Value {
     json!({
         "id": key.id, "name": key.name.as_str(), "scope": key.scope.as_str(), "state": state(key), "projects": projects,
         "max_bytes": key.limits.bytes, "max_scans": key.limits.scans, "max_queued_jobs": key.limits.queued_jobs,
+        "max_open_uploads": key.limits.open_uploads,
         "created": key.created, "expires": key.expires, "revoked": key.revoked,
     })
 }

@@ -56,3 +56,8 @@ pub(super) fn within(setting: &'static str, value: u64, least: u64, most: u64) -
         Err(ConfigError::OutOfRange { setting, value, least, most })
     }
 }
+
+/// How often something may happen; 0 is any number of times.
+pub(super) fn rate(setting: &'static str, value: u64) -> Result<u32, ConfigError> {
+    Ok(within(setting, value, 0, 1_000_000)? as u32)
+}

@@ -10,13 +10,13 @@ use std::time::Duration;
 
 use axum::http::HeaderValue;
 
-use checks::{both, listed, origin, within};
+use checks::{both, listed, origin, rate, within};
 pub use error::ConfigError;
 pub use settings::Settings;
 
-use crate::http::{ConnectionLimits, LoadLimits};
+use crate::http::{ConnectionLimits, LoadLimits, Proxies, RateLimits};
 use crate::jobs::webhooks::{CourierOptions, Targets};
-use crate::jobs::{Isolated, WorkerOptions};
+use crate::jobs::{IntakeLimits, Isolated, WorkerOptions};
 use crate::project::Limits;
 
 /// What the service runs with.
@@ -28,10 +28,8 @@ pub struct Config {
     pub data: PathBuf,
     /// Threads that compute; 0 is one for each core.
     pub threads: usize,
-    /// Largest upload, bytes.
-    pub max_upload_bytes: u64,
-    /// How long an upload may send nothing.
-    pub upload_idle: Duration,
+    /// What is taken in.
+    pub intake: IntakeLimits,
     /// How long an upload in several requests is kept without being continued.
     pub upload_expiry: Duration,
     /// The worker pool.
@@ -45,6 +43,10 @@ pub struct Config {
     pub origins: Vec<HeaderValue>,
     /// What connections may do.
     pub connections: ConnectionLimits,
+    /// How often one address may ask.
+    pub rates: RateLimits,
+    /// Who is believed when it says for whom it asks.
+    pub proxies: Proxies,
     /// When no more work is taken on.
     pub load: LoadLimits,
     /// What each project may have.
@@ -73,6 +75,7 @@ impl Settings {
             i64::MAX as u64,
         )?;
         let max_points = within("max-points", self.max_points.unwrap_or(200_000_000), 1, u32::MAX.into())?;
+        let free_bytes = self.min_free_bytes.unwrap_or(1 << 30);
         let isolated = self.program.map(|program| Isolated {
             which: self.isolation.unwrap_or_default(),
             program,
@@ -83,13 +86,17 @@ impl Settings {
             listen: self.listen.unwrap_or_else(|| SocketAddr::from(([127, 0, 0, 1], 8080))),
             data: self.data.unwrap_or_else(|| PathBuf::from(DEFAULT_DATA)),
             threads: within("threads", threads, 0, 1024)? as usize,
-            max_upload_bytes: within(
-                "max-upload-bytes",
-                self.max_upload_bytes.unwrap_or(16 << 30),
-                1,
-                i64::MAX as u64,
-            )?,
-            upload_idle: seconds("upload-idle-seconds", self.upload_idle_seconds, 60)?,
+            intake: IntakeLimits {
+                max_bytes: within(
+                    "max-upload-bytes",
+                    self.max_upload_bytes.unwrap_or(16 << 30),
+                    1,
+                    // The sum over all that a project may have begun must be a number as well.
+                    1 << 48,
+                )?,
+                idle: seconds("upload-idle-seconds", self.upload_idle_seconds, 60)?,
+                free_bytes,
+            },
             upload_expiry: Duration::from_hours(within(
                 "upload-expiry-hours",
                 self.upload_expiry_hours.unwrap_or(168),
@@ -119,16 +126,28 @@ impl Settings {
                 .collect::<Result<_, _>>()?,
             connections: ConnectionLimits {
                 most: within("max-connections", self.max_connections.unwrap_or(1024), 1, 1 << 20)? as usize,
+                most_per_address: within(
+                    "max-connections-per-address",
+                    self.max_connections_per_address.unwrap_or(256),
+                    1,
+                    1 << 20,
+                )? as usize,
                 idle: seconds("idle-seconds", self.idle_seconds, 60)?,
             },
+            rates: RateLimits {
+                requests_per_second: rate("requests-per-second", self.requests_per_second.unwrap_or(200))?,
+                failures_per_minute: rate("failures-per-minute", self.failures_per_minute.unwrap_or(30))?,
+            },
+            proxies: Proxies(listed("trusted-proxies", self.trusted_proxies)?),
             load: LoadLimits {
                 open_jobs: within("max-open-jobs", self.max_open_jobs.unwrap_or(100_000), 1, 1 << 40)?,
-                free_bytes: self.min_free_bytes.unwrap_or(1 << 30),
+                free_bytes,
             },
             project_limits: Limits {
                 bytes: self.project_max_bytes,
                 scans: self.project_max_scans,
                 queued_jobs: self.project_max_queued_jobs,
+                open_uploads: Some(self.project_max_open_uploads.unwrap_or(1000)),
             },
             webhooks: CourierOptions {
                 targets: Targets {

@@ -37,7 +37,7 @@ pub struct Settings {
     /// Seconds between looks at the queue when nothing happens [default: 2]
     #[arg(long, env = "CAIRN_POLL_SECONDS", value_name = "SECONDS")]
     pub poll_seconds: Option<u64>,
-    /// Seconds after which an upload that sends nothing is given up [default: 60]
+    /// Seconds after which an upload is given up of which no further kilobyte came [default: 60]
     #[arg(long, env = "CAIRN_UPLOAD_IDLE_SECONDS", value_name = "SECONDS")]
     pub upload_idle_seconds: Option<u64>,
     /// Hours after which a resumable upload that is not continued is forgotten [default: 168, which is a week]
@@ -76,6 +76,18 @@ pub struct Settings {
     /// Connections at once; more wait [default: 1024]
     #[arg(long, env = "CAIRN_MAX_CONNECTIONS", value_name = "N")]
     pub max_connections: Option<u64>,
+    /// Connections at once from one address that is no trusted proxy; more are closed [default: 256]
+    #[arg(long, env = "CAIRN_MAX_CONNECTIONS_PER_ADDRESS", value_name = "N")]
+    pub max_connections_per_address: Option<u64>,
+    /// Requests a second from one address, ten seconds' worth of them at once; more are refused with 429, 0 is no limit [default: 200]
+    #[arg(long, env = "CAIRN_REQUESTS_PER_SECOND", value_name = "N")]
+    pub requests_per_second: Option<u64>,
+    /// Requests a minute from one address with keys that open nothing; more are refused with 429, 0 is no limit [default: 30]
+    #[arg(long, env = "CAIRN_FAILURES_PER_MINUTE", value_name = "N")]
+    pub failures_per_minute: Option<u64>,
+    /// Proxies whose `X-Forwarded-For` is believed, such as 127.0.0.1 or 10.1.0.0/16, separated by commas [default: none]
+    #[arg(long, env = "CAIRN_TRUSTED_PROXIES", value_name = "NETWORKS", value_delimiter = ',')]
+    pub trusted_proxies: Option<Vec<String>>,
     /// Seconds for which a connection may be silent between requests, take for the head of one, or not read an answer [default: 60]
     #[arg(long, env = "CAIRN_IDLE_SECONDS", value_name = "SECONDS")]
     pub idle_seconds: Option<u64>,
@@ -94,6 +106,9 @@ pub struct Settings {
     /// Jobs of a project that may wait or run [default: no limit]
     #[arg(long, env = "CAIRN_PROJECT_MAX_QUEUED_JOBS", value_name = "N")]
     pub project_max_queued_jobs: Option<u64>,
+    /// Resumable uploads of a project that may be begun and not complete [default: 1000]
+    #[arg(long, env = "CAIRN_PROJECT_MAX_OPEN_UPLOADS", value_name = "N")]
+    pub project_max_open_uploads: Option<u64>,
     /// Hosts to which webhooks may be sent, such as hooks.example.com or *.example.com, separated by commas [default: none]
     #[arg(long, env = "CAIRN_WEBHOOK_HOSTS", value_name = "HOSTS", value_delimiter = ',')]
     pub webhook_hosts: Option<Vec<String>>,
@@ -140,12 +155,19 @@ impl Settings {
             tls_key: self.tls_key.or(other.tls_key),
             cors_origins: self.cors_origins.or(other.cors_origins),
             max_connections: self.max_connections.or(other.max_connections),
+            max_connections_per_address: self
+                .max_connections_per_address
+                .or(other.max_connections_per_address),
+            requests_per_second: self.requests_per_second.or(other.requests_per_second),
+            failures_per_minute: self.failures_per_minute.or(other.failures_per_minute),
+            trusted_proxies: self.trusted_proxies.or(other.trusted_proxies),
             idle_seconds: self.idle_seconds.or(other.idle_seconds),
             max_open_jobs: self.max_open_jobs.or(other.max_open_jobs),
             min_free_bytes: self.min_free_bytes.or(other.min_free_bytes),
             project_max_bytes: self.project_max_bytes.or(other.project_max_bytes),
             project_max_scans: self.project_max_scans.or(other.project_max_scans),
             project_max_queued_jobs: self.project_max_queued_jobs.or(other.project_max_queued_jobs),
+            project_max_open_uploads: self.project_max_open_uploads.or(other.project_max_open_uploads),
             webhook_hosts: self.webhook_hosts.or(other.webhook_hosts),
             webhook_networks: self.webhook_networks.or(other.webhook_networks),
             webhook_retry_seconds: self.webhook_retry_seconds.or(other.webhook_retry_seconds),

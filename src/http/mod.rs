@@ -34,9 +34,9 @@ mod tus;
 mod upload;
 mod webhook;
 
-pub use access::{Access, LoadLimits, Openness};
+pub use access::{Access, LoadLimits, Network, Openness, Proxies, RateLimits, Rates};
 pub use content_digest::parse_content_digest;
-pub use listen::{ConnectionLimits, TlsError, acceptor, serve};
+pub use listen::{Certificates, ConnectionLimits, Entrance, TlsError, serve};
 pub use metrics::Metrics;
 pub use problem::Problem;
 pub use readiness::Readiness;

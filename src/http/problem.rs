@@ -90,6 +90,15 @@ impl Problem {
         )
     }
 
+    /// The disk is nearly full, and what little is left is for the work that was taken on.
+    pub(super) fn low_disk() -> Self {
+        let detail = "the service has too little space left to take this in";
+        Self {
+            retry_after: NonZeroU16::new(30),
+            ..Self::new(StatusCode::SERVICE_UNAVAILABLE, "low-disk", detail)
+        }
+    }
+
     /// The machine lacks something, and may have it again soon.
     fn unavailable(trouble: Trouble, cause: &StorageError) -> Self {
         tracing::error!(%cause, "a request could not be served");
@@ -172,8 +181,12 @@ impl From<StorageError> for Problem {
             ),
             StorageError::OverQuota { quota, limit, .. } => Self {
                 limit: Some(limit),
-                // Jobs end by themselves; room for scans comes when somebody deletes some or raises the limit.
-                retry_after: NonZeroU16::new(if quota == Quota::QueuedJobs { 10 } else { 3600 }),
+                retry_after: NonZeroU16::new(match quota {
+                    // These end by themselves; room for scans comes when somebody deletes some or raises the limit.
+                    Quota::QueuedJobs => 10,
+                    Quota::OpenUploads => 60,
+                    Quota::Bytes | Quota::Scans => 3600,
+                }),
                 ..Self::new(StatusCode::TOO_MANY_REQUESTS, "over-quota", error.to_string())
             },
             StorageError::TooManyWebhooks { limit, .. } => Self {
@@ -220,6 +233,7 @@ impl From<IntakeError> for Problem {
                 Self::new(StatusCode::BAD_REQUEST, "upload-interrupted", detail)
             }
             IntakeError::Stalled { .. } => Self::new(StatusCode::REQUEST_TIMEOUT, "upload-stalled", detail),
+            IntakeError::LowDisk => Self::low_disk(),
             IntakeError::Storage(error) => error.into(),
         }
     }
@@ -234,6 +248,7 @@ impl From<ExportError> for Problem {
                 limit: Some(limit),
                 ..Self::new(StatusCode::UNPROCESSABLE_ENTITY, "too-fine", error.to_string())
             },
+            ExportError::LowDisk => Self::low_disk(),
             ExportError::Storage(error) => error.into(),
             other => Self::internal(other),
         }

@@ -71,7 +71,10 @@ impl From<Project> for ProjectBody {
         let own = format!("/v1/projects/{}", p.id);
         let below = |rel: &str| Link::new(rel, format!("{own}/{rel}"));
         let mut links = vec![Link::new("self", own.clone())];
-        links.extend(["scans", "jobs", "model", "versions", "poses", "cloud", "graph", "preview"].map(below));
+        links.extend(
+            ["scans", "uploads", "jobs", "model", "versions", "poses", "cloud", "graph", "preview"]
+                .map(below),
+        );
         Self {
             id: p.id,
             name: p.name,

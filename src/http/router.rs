@@ -144,6 +144,7 @@ pub fn router(api: Api) -> Router {
         .layer(from_fn_with_state((api.clone(), Running::default()), idempotent))
         .layer(from_fn_with_state(api.clone(), access::shed))
         .layer(from_fn_with_state(api.clone(), access::guard))
+        .layer(from_fn_with_state(api.clone(), access::pace))
         .layer(from_fn_with_state(api.clone(), metrics::observe))
         .layer(option_layer(shield::cors(&api.access.origins)))
         .layer(from_fn(shield::harden))

@@ -3,7 +3,7 @@
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::IntoResponse;
 use serde::Serialize;
 use utoipa::ToSchema;
@@ -67,6 +67,10 @@ pub(super) async fn upload_scan(
         digests: content_digest(&headers)?,
     };
     query.finish()?;
+    if is_form(&headers) {
+        let detail = "send the file itself as the body (curl -T FILE), not in a form";
+        return Err(Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "not-a-file", detail));
+    }
     let admission = api.intake.receive(request, body.into_data_stream()).await?;
     api.metrics.uploaded(admission.scan.bytes, admission.duplicate);
     let status = if admission.duplicate { StatusCode::OK } else { StatusCode::ACCEPTED };
@@ -74,6 +78,12 @@ pub(super) async fn upload_scan(
     let body =
         UploadBody { scan: admission.scan.into(), job: admission.job.into(), duplicate: admission.duplicate };
     Ok((status, [(header::LOCATION, location), (header::RETRY_AFTER, "1".to_owned())], Json(body)))
+}
+
+/// Whether the body is a form with files in it, which clients may take for the way to upload.
+fn is_form(headers: &HeaderMap) -> bool {
+    let kind = headers.get(header::CONTENT_TYPE).map(HeaderValue::as_bytes).unwrap_or_default();
+    kind.get(..10).is_some_and(|start| start.eq_ignore_ascii_case(b"multipart/"))
 }
 
 fn declared(headers: &HeaderMap) -> Option<u64> {

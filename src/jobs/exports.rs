@@ -7,6 +7,7 @@ use std::io::{self, BufWriter};
 use std::sync::Arc;
 
 use tokio::sync::Mutex;
+use tracing::Instrument;
 
 use super::merge::Merge;
 use super::picture::draw;
@@ -47,6 +48,9 @@ pub enum ExportError {
         /// The limit.
         limit: u64,
     },
+    /// There is too little disk left to keep another file.
+    #[error("the service has too little space left to make this file")]
+    LowDisk,
     /// State could not be read or written.
     #[error(transparent)]
     Storage(#[from] StorageError),
@@ -70,6 +74,7 @@ pub struct Exports {
     store: Store,
     compute: Compute,
     max_points: u64,
+    free_bytes: u64,
     /// One at a time: a merged cloud may take gigabytes of disk and all threads.
     building: Arc<Mutex<()>>,
 }
@@ -78,10 +83,11 @@ pub struct Exports {
 const FORM: &str = "export/1";
 
 impl Exports {
-    /// Exports from this store. Uploads of more than `max_points` were never accepted.
+    /// Exports from this store. Uploads of more than `max_points` were never accepted; nothing new is made while fewer than
+    /// `free_bytes` of disk are free.
     #[must_use]
-    pub fn new(store: Store, compute: Compute, max_points: u64) -> Self {
-        Self { store, compute, max_points, building: Arc::default() }
+    pub fn new(store: Store, compute: Compute, max_points: u64, free_bytes: u64) -> Self {
+        Self { store, compute, max_points, free_bytes, building: Arc::default() }
     }
 
     /// The merged cloud of a version as binary PLY, in metres, in the frame of its component.
@@ -122,14 +128,24 @@ impl Exports {
         if let Some(found) = self.remembered(&key).await? {
             return Ok(found);
         }
-        let _turn = self.building.lock().await;
+        let turn = Arc::clone(&self.building).lock_owned().await;
         // Whoever was before us may have made it.
         if let Some(found) = self.remembered(&key).await? {
             return Ok(found);
         }
-        let fresh = self.compute.run(make).await??;
-        self.store.remember(&key, Owner { project, scan: None }, &fresh).await?;
-        Ok(*fresh)
+        if self.store.free_bytes()? < self.free_bytes {
+            return Err(ExportError::LowDisk);
+        }
+        let (compute, store) = (self.compute.clone(), self.store.clone());
+        // A computation does not stop when its client leaves, so the turn stays with it: clients that come and go would have any
+        // number of them run at once.
+        let making = async move {
+            let _turn = turn;
+            let fresh = compute.run(make).await??;
+            store.remember(&key, Owner { project, scan: None }, &fresh).await?;
+            Ok(*fresh)
+        };
+        tokio::spawn(making.in_current_span()).await.map_err(|e| Panicked(e.to_string()))?
     }
 
     /// The remembered file, if it is sound: one that is not is made again.

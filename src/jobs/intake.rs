@@ -4,13 +4,14 @@ use std::fmt::Display;
 use std::time::Duration;
 
 use bytes::Bytes;
-use futures_util::{Stream, StreamExt};
+use futures_util::Stream;
 
 use crate::cloud::{Format, ScanKey, sniff};
 use crate::project::{Interpretation, KeyId, Name, ProjectId};
 use crate::storage::{Admission, NewScan, StorageError, Store, StoredBlob};
 
 use super::digest::{DigestCheck, DigestMismatch, ExpectedDigest};
+use super::pace::Pace;
 use super::parameters::content_key;
 
 /// What a client says about the bytes that it sends.
@@ -66,35 +67,50 @@ pub enum IntakeError {
         /// What the connection said.
         reason: String,
     },
-    /// Nothing came for too long.
-    #[error("no byte came for {} s, after {received} bytes", idle.as_secs())]
+    /// Nothing came for too long, or next to nothing.
+    #[error("nearly nothing came for {} s, after {received} bytes", idle.as_secs())]
     Stalled {
         /// Bytes until then.
         received: u64,
         /// How long was waited.
         idle: Duration,
     },
+    /// It would leave too little disk for the work that was taken on.
+    #[error("the service has too little space left to take this in")]
+    LowDisk,
     /// It could not be stored.
     #[error(transparent)]
     Storage(#[from] StorageError),
+}
+
+/// What is taken in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct IntakeLimits {
+    /// The largest upload, bytes.
+    pub max_bytes: u64,
+    /// How long next to nothing may come.
+    pub idle: Duration,
+    /// Bytes of disk that must stay free.
+    pub free_bytes: u64,
 }
 
 /// Takes uploads in.
 #[derive(Debug, Clone)]
 pub struct Intake {
     store: Store,
-    max_bytes: u64,
-    idle: Duration,
+    limits: IntakeLimits,
 }
 
 /// As much of an upload as is looked at to recognise its format.
 pub(super) const HEAD_BYTES: usize = 16 * 1024;
+/// Bytes after which it is asked again whether there is room for more.
+const ASK_EVERY: u64 = 32 << 20;
 
 impl Intake {
-    /// Takes uploads of at most `max_bytes` in; gives one up when nothing comes for `idle`.
+    /// Takes uploads in within these limits.
     #[must_use]
-    pub fn new(store: Store, max_bytes: u64, idle: Duration) -> Self {
-        Self { store, max_bytes, idle }
+    pub fn new(store: Store, limits: IntakeLimits) -> Self {
+        Self { store, limits }
     }
 
     /// Receives one upload. When this returns, its bytes are synced and its row is committed.
@@ -103,27 +119,34 @@ impl Intake {
         request: UploadRequest,
         body: impl Stream<Item = Result<Bytes, E>> + Send,
     ) -> Result<Admission, IntakeError> {
-        let limit = self.max_bytes;
+        let limit = self.limits.max_bytes;
         if request.declared_bytes.is_some_and(|n| n > limit) {
             return Err(IntakeError::TooLarge { limit });
         }
         self.store.project(request.project).await?;
         let declared = request.declared_bytes.unwrap_or(1);
         self.store.check_upload(request.project, request.sender, declared).await?;
+        self.check_room(declared)?;
         let mut writer = self.store.blobs.writer();
         let mut head = Vec::new();
         let mut format = None;
         let mut check = DigestCheck::new(request.digests);
-        let mut body = std::pin::pin!(body);
+        let (mut body, mut pace) = (std::pin::pin!(body), Pace::new(self.limits.idle));
+        let mut asked = 0;
         loop {
             let received = writer.bytes();
-            let next = tokio::time::timeout(self.idle, body.next())
-                .await
-                .map_err(|_| IntakeError::Stalled { received, idle: self.idle })?;
-            let Some(piece) = next else { break };
+            let stalled = |_| IntakeError::Stalled { received, idle: self.limits.idle };
+            let Some(piece) = pace.next(&mut body).await.map_err(stalled)? else { break };
             let piece = piece.map_err(|e| IntakeError::Interrupted { received, reason: e.to_string() })?;
             if received + piece.len() as u64 > limit {
                 return Err(IntakeError::TooLarge { limit });
+            }
+            if received - asked >= ASK_EVERY {
+                asked = received;
+                self.check_room(0)?;
+                if request.declared_bytes.is_none() {
+                    self.store.check_upload(request.project, request.sender, received).await?;
+                }
             }
             check.update(&piece);
             writer.write(&piece).await?;
@@ -149,12 +172,22 @@ impl Intake {
 
     /// The largest upload, bytes.
     pub(super) fn max_bytes(&self) -> u64 {
-        self.max_bytes
+        self.limits.max_bytes
     }
 
-    /// How long nothing may come.
+    /// How long next to nothing may come.
     pub(super) fn idle(&self) -> Duration {
-        self.idle
+        self.limits.idle
+    }
+
+    /// Fails if so many bytes more would leave too little disk.
+    pub(super) fn check_room(&self, bytes: u64) -> Result<(), IntakeError> {
+        let left = self.store.free_bytes()?.checked_sub(bytes);
+        if left.is_some_and(|left| left >= self.limits.free_bytes) {
+            Ok(())
+        } else {
+            Err(IntakeError::LowDisk)
+        }
     }
 }
 

@@ -14,6 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::digest::{DigestCheck, DigestMismatch, ExpectedDigest};
 use super::intake::{HEAD_BYTES, Intake, IntakeError, recognise, scan_of};
+use super::pace::Pace;
 use super::turnstile::{Turn, Turnstile};
 use crate::project::{NewUpload, Timestamp, Upload, UploadEnd, UploadId};
 use crate::storage::{BlobId, FreshBlob, Seal, StorageError, Store, StoredBlob, UploadFile};
@@ -116,6 +117,7 @@ impl Resumable {
         if new.length == 0 {
             return Err(IntakeError::Empty.into());
         }
+        self.intake.check_room(new.length)?;
         Ok(self.store.create_upload(new, self.expiry(), seal).await?)
     }
 
@@ -192,13 +194,14 @@ impl Resumable {
         mut body: impl Stream<Item = Result<Bytes, E>> + Unpin + Send,
     ) -> Result<(), ResumableError> {
         let (length, idle) = (upload.announced.length, self.intake.idle());
+        let mut pace = Pace::new(idle);
         loop {
             let received = arrival.written;
             let next = tokio::select! {
                 biased;
                 () = turn.leave.cancelled() => return Err(ResumableError::TakenOver),
                 () = self.stop.cancelled() => return Err(ResumableError::Stopping),
-                next = tokio::time::timeout(idle, body.next()) => next,
+                next = pace.next(&mut body) => next,
             };
             let Some(piece) = next.map_err(|_| IntakeError::Stalled { received, idle })? else {
                 return Ok(());
@@ -213,7 +216,11 @@ impl Resumable {
                 recognise(&arrival.head, &upload.announced.name)?;
             }
             let unsafe_bytes = arrival.written - arrival.kept;
-            if arrival.check.is_empty() && unsafe_bytes >= CHECKPOINT && arrival.written < length {
+            if unsafe_bytes < CHECKPOINT || arrival.written == length {
+                continue;
+            }
+            self.intake.check_room(0)?;
+            if arrival.check.is_empty() {
                 arrival.file.sync().await?;
                 self.store.advance_upload(upload.id, arrival.written, self.expiry()).await?;
                 arrival.kept = arrival.written;
@@ -311,7 +318,9 @@ impl ResumableError {
             self,
             Self::TakenOver
                 | Self::Stopping
-                | Self::Intake(IntakeError::Stalled { .. } | IntakeError::Interrupted { .. })
+                | Self::Intake(
+                    IntakeError::Stalled { .. } | IntakeError::Interrupted { .. } | IntakeError::LowDisk
+                )
         )
     }
 }

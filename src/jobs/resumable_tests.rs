@@ -11,7 +11,10 @@ use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 
-use super::{Continuation, DigestAlgorithm, ExpectedDigest, Intake, IntakeError, Resumable, ResumableError};
+use super::{
+    Continuation, DigestAlgorithm, ExpectedDigest, Intake, IntakeError, IntakeLimits, Resumable,
+    ResumableError,
+};
 use crate::project::{Interpretation, Name, NewUpload, ProjectId, ProjectSettings, UploadId};
 use crate::storage::{Page, Seal, StorageError, Store};
 
@@ -61,7 +64,8 @@ impl Service {
 }
 
 fn resumable(store: &Store) -> Resumable {
-    let intake = Intake::new(store.clone(), LIMIT, Duration::from_secs(5));
+    let limits = IntakeLimits { max_bytes: LIMIT, idle: Duration::from_secs(5), free_bytes: 0 };
+    let intake = Intake::new(store.clone(), limits);
     Resumable::new(store.clone(), intake, Duration::from_hours(1), CancellationToken::new())
 }
 

@@ -65,6 +65,8 @@ pub struct Limits {
     pub scans: Option<u64>,
     /// Jobs that have not ended.
     pub queued_jobs: Option<u64>,
+    /// Uploads in several requests that are neither complete nor expired.
+    pub open_uploads: Option<u64>,
 }
 
 /// A key, without its secret.

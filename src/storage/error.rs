@@ -161,6 +161,7 @@ fn thing(quota: Quota) -> &'static str {
         Quota::Bytes => "bytes of scans",
         Quota::Scans => "scans",
         Quota::QueuedJobs => "jobs that have not ended",
+        Quota::OpenUploads => "uploads that are not complete",
     }
 }
 
@@ -180,6 +181,8 @@ impl StorageError {
                 _ => Trouble::Failing,
             }),
             Self::Database(sqlx::Error::PoolTimedOut) => Some(Trouble::Busy),
+            // A commit failed under the connection, and so did the one that took its place: the disk goes on failing.
+            Self::Database(sqlx::Error::InvalidSavePointStatement) => Some(Trouble::Failing),
             Self::Database(sqlx::Error::Database(error)) => {
                 let code: i32 = error.code()?.parse().ok()?;
                 match code & 0xff {

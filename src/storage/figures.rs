@@ -23,6 +23,10 @@ pub struct Figures {
     pub versions: u64,
     /// Messages to webhooks that wait to be sent.
     pub deliveries: u64,
+    /// Resumable uploads that are neither complete nor expired.
+    pub open_uploads: u64,
+    /// Bytes of them that have come.
+    pub open_upload_bytes: u64,
 }
 
 /// A job that has ended.
@@ -58,8 +62,12 @@ impl Store {
         let rest = sqlx::query(
             "SELECT (SELECT COUNT(*) FROM projects) AS projects, (SELECT COUNT(*) FROM projects WHERE head > 0) AS models,
                (SELECT COUNT(*) FROM versions) AS versions,
-               (SELECT COUNT(*) FROM deliveries WHERE state = 'pending') AS deliveries",
+               (SELECT COUNT(*) FROM deliveries WHERE state = 'pending') AS deliveries,
+               u.n AS open_uploads, u.bytes AS open_upload_bytes
+               FROM (SELECT COUNT(*) AS n, COALESCE(SUM(received), 0) AS bytes FROM uploads
+                     WHERE scan_id IS NULL AND expires_ms > ?) u",
         )
+        .bind(Timestamp::now().0)
         .fetch_one(&self.read)
         .await?;
         let mut figures = Figures {
@@ -67,6 +75,8 @@ impl Store {
             models: count(&rest, "models")?,
             versions: count(&rest, "versions")?,
             deliveries: count(&rest, "deliveries")?,
+            open_uploads: count(&rest, "open_uploads")?,
+            open_upload_bytes: count(&rest, "open_upload_bytes")?,
             ..Figures::default()
         };
         for row in &jobs {

@@ -77,7 +77,7 @@ impl Keys {
         let mut tx = self.begin().await?;
         sqlx::query(
             "INSERT INTO keys (id, name, digest, scope, every_project, max_bytes, max_scans, max_queued_jobs,
-               created_ms, expires_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+               max_open_uploads, created_ms, expires_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         )
         .bind(token.key.to_string())
         .bind(new.name.as_str())
@@ -87,6 +87,7 @@ impl Keys {
         .bind(new.limits.bytes.map(u64::cast_signed))
         .bind(new.limits.scans.map(u64::cast_signed))
         .bind(new.limits.queued_jobs.map(u64::cast_signed))
+        .bind(new.limits.open_uploads.map(u64::cast_signed))
         .bind(now.0)
         .bind(new.expires.map(|end| end.0))
         .execute(&mut *tx)
@@ -202,6 +203,7 @@ pub(super) fn limits(row: &SqliteRow) -> Result<Limits, StorageError> {
         bytes: limit("max_bytes")?,
         scans: limit("max_scans")?,
         queued_jobs: limit("max_queued_jobs")?,
+        open_uploads: limit("max_open_uploads")?,
     })
 }
 
@@ -214,7 +216,7 @@ mod tests {
     use crate::storage::Seal;
 
     fn new(reach: Reach) -> NewKey {
-        let limits = Limits { bytes: Some(7), scans: None, queued_jobs: Some(2) };
+        let limits = Limits { bytes: Some(7), scans: None, queued_jobs: Some(2), open_uploads: Some(3) };
         let name = Name::parse("rig 3").unwrap();
         NewKey { name, scope: Scope::Upload, reach, limits, expires: None }
     }

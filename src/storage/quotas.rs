@@ -8,7 +8,7 @@ use sqlx::SqliteConnection;
 
 use super::rows::count;
 use super::{StorageError, Store};
-use crate::project::{KeyId, Limits, ProjectId};
+use crate::project::{KeyId, Limits, ProjectId, Timestamp, UploadId};
 
 /// Whose limit it is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,6 +28,8 @@ pub enum Quota {
     Scans,
     /// Jobs that wait or run. It passes by itself.
     QueuedJobs,
+    /// Uploads that were announced and are not complete. It passes when they end or expire.
+    OpenUploads,
 }
 
 /// What a request would add.
@@ -36,6 +38,9 @@ pub(super) struct Addition {
     pub bytes: u64,
     pub scans: u64,
     pub jobs: u64,
+    pub uploads: u64,
+    /// The upload that this was announced as, which therefore does not count twice.
+    pub announced: Option<UploadId>,
 }
 
 impl Store {
@@ -46,32 +51,8 @@ impl Store {
         key: Option<KeyId>,
         bytes: u64,
     ) -> Result<(), StorageError> {
-        self.check_announcement(&mut *self.read.acquire().await?, project, key, bytes).await
-    }
-
-    /// The same within a transaction. Uploads that were announced and have not ended count as if they had.
-    pub(super) async fn check_announcement(
-        &self,
-        connection: &mut SqliteConnection,
-        project: ProjectId,
-        key: Option<KeyId>,
-        bytes: u64,
-    ) -> Result<(), StorageError> {
-        let announced = |column| {
-            format!(
-                "SELECT COALESCE(SUM(length), 0) AS bytes, COUNT(*) AS scans FROM uploads WHERE {column} = ? AND scan_id IS NULL"
-            )
-        };
-        for (holder, limits) in self.holders(connection, project, key).await? {
-            let row = sqlx::query(sqlx::AssertSqlSafe(announced(holder.column())))
-                .bind(holder.id())
-                .fetch_one(&mut *connection)
-                .await?;
-            let (coming, scans): (u64, u64) = (count(&row, "bytes")?, count(&row, "scans")?);
-            let more = Addition { bytes: bytes.saturating_add(coming), scans: scans + 1, jobs: 1 };
-            within(connection, holder, limits, more).await?;
-        }
-        Ok(())
+        let more = Addition { bytes, scans: 1, jobs: 1, ..Addition::default() };
+        self.check_quotas(&mut *self.read.acquire().await?, project, key, more).await
     }
 
     /// Fails if what is to be added passes a limit of the project or of the key.
@@ -115,11 +96,13 @@ impl Store {
     ) -> Result<Vec<(Holder, Limits)>, StorageError> {
         let mut holders = vec![(Holder::Project(project), self.project_limits())];
         if let Some(key) = key {
-            let row = sqlx::query("SELECT max_bytes, max_scans, max_queued_jobs FROM keys WHERE id = ?")
-                .bind(key.to_string())
-                .fetch_optional(connection)
-                .await?
-                .ok_or(StorageError::NoKey(key))?;
+            let row = sqlx::query(
+                "SELECT max_bytes, max_scans, max_queued_jobs, max_open_uploads FROM keys WHERE id = ?",
+            )
+            .bind(key.to_string())
+            .fetch_optional(connection)
+            .await?
+            .ok_or(StorageError::NoKey(key))?;
             holders.push((Holder::Key(key), super::keys::limits(&row)?));
         }
         holders.retain(|(_, limits)| *limits != Limits::default());
@@ -143,6 +126,7 @@ impl Holder {
     }
 }
 
+/// Fails if a holder would have more than it may. What was announced and has not ended counts as if it were there.
 async fn within(
     connection: &mut SqliteConnection,
     holder: Holder,
@@ -151,21 +135,27 @@ async fn within(
 ) -> Result<(), StorageError> {
     let of = holder.column();
     let row = sqlx::query(sqlx::AssertSqlSafe(format!(
-        "SELECT COUNT(*) AS scans, COALESCE(SUM(bytes), 0) AS bytes, (SELECT COUNT(*) FROM jobs
-           WHERE {of} = ?1 AND state IN ('accepted', 'running')) AS jobs
-         FROM scans WHERE {of} = ?1 AND deleted_ms IS NULL"
+        "WITH kept AS (SELECT COUNT(*) AS n, COALESCE(SUM(bytes), 0) AS bytes FROM scans
+                       WHERE {of} = ?1 AND deleted_ms IS NULL),
+              coming AS (SELECT COUNT(*) AS n, COALESCE(SUM(length), 0) AS bytes FROM uploads
+                         WHERE {of} = ?1 AND scan_id IS NULL AND expires_ms > ?2 AND id IS NOT ?3)
+         SELECT kept.n + coming.n AS scans, kept.bytes + coming.bytes AS bytes, coming.n AS uploads,
+           (SELECT COUNT(*) FROM jobs WHERE {of} = ?1 AND state IN ('accepted', 'running')) AS jobs
+         FROM kept, coming"
     )))
     .bind(holder.id())
+    .bind(Timestamp::now().0)
+    .bind(more.announced.map(|id| id.to_string()))
     .fetch_one(connection)
     .await?;
-    let has =
-        Addition { bytes: count(&row, "bytes")?, scans: count(&row, "scans")?, jobs: count(&row, "jobs")? };
     let checks = [
-        (Quota::Bytes, has.bytes, more.bytes, limits.bytes),
-        (Quota::Scans, has.scans, more.scans, limits.scans),
-        (Quota::QueuedJobs, has.jobs, more.jobs, limits.queued_jobs),
+        (Quota::Bytes, "bytes", more.bytes, limits.bytes),
+        (Quota::Scans, "scans", more.scans, limits.scans),
+        (Quota::QueuedJobs, "jobs", more.jobs, limits.queued_jobs),
+        (Quota::OpenUploads, "uploads", more.uploads, limits.open_uploads),
     ];
-    for (quota, has, more, limit) in checks {
+    for (quota, column, more, limit) in checks {
+        let has: u64 = count(&row, column)?;
         if let Some(limit) = limit
             && more > 0
             && has.saturating_add(more) > limit

@@ -9,7 +9,7 @@ use super::rows::{count, json, parsed, to_json, word};
 use super::{BlobId, Page, StorageError, Store};
 use crate::project::{
     ContentKey, Interpretation, Job, JobId, JobKind, KeyId, Lane, Name, ProjectId, Scan, ScanId, ScanState,
-    Standing, Timestamp, UploadEnd,
+    Standing, Timestamp, UploadEnd, UploadId,
 };
 
 /// An upload that is safe on disk and waits to be acknowledged.
@@ -49,7 +49,7 @@ impl Store {
     /// answered with the scan that it is; if that has failed or was dismissed, a new job tries again.
     pub async fn admit_scan(&self, new: &NewScan) -> Result<Admission, StorageError> {
         let mut tx = self.begin().await?;
-        let admitted = self.admit(&mut tx, new, Timestamp::now()).await?;
+        let admitted = self.admit(&mut tx, new, None, Timestamp::now()).await?;
         tx.commit().await?;
         self.admitted(new.project, admitted).await
     }
@@ -68,11 +68,12 @@ impl Store {
         Ok(Admission { scan, job, duplicate })
     }
 
-    /// Admits a scan within a transaction.
+    /// Admits a scan within a transaction; `announced` is the upload that it came as, if in several requests.
     pub(super) async fn admit(
         &self,
         tx: &mut Transaction<'static, Sqlite>,
         new: &NewScan,
+        announced: Option<UploadId>,
         now: Timestamp,
     ) -> Result<UploadEnd, StorageError> {
         let known = sqlx::query(
@@ -83,26 +84,16 @@ impl Store {
         .fetch_optional(&mut **tx)
         .await?;
         let Some(row) = known else {
-            self.check_quotas(
-                &mut *tx,
-                new.project,
-                new.sender,
-                Addition { bytes: new.bytes, scans: 1, jobs: 1 },
-            )
-            .await?;
+            let more = Addition { bytes: new.bytes, scans: 1, jobs: 1, announced, ..Addition::default() };
+            self.check_quotas(&mut *tx, new.project, new.sender, more).await?;
             let (scan, job) = insert_scan(tx, new, now).await?;
             return Ok(UploadEnd { scan, job, duplicate: false });
         };
         let scan = parsed(&row, "id")?;
         match word(&row, "state", ScanState::from_word)? {
             ScanState::Failed | ScanState::Dismissed => {
-                self.check_quotas(
-                    &mut *tx,
-                    new.project,
-                    new.sender,
-                    Addition { jobs: 1, ..Addition::default() },
-                )
-                .await?;
+                let more = Addition { jobs: 1, ..Addition::default() };
+                self.check_quotas(&mut *tx, new.project, new.sender, more).await?;
                 Ok(UploadEnd { scan, job: try_again(tx, new, scan, now).await?, duplicate: false })
             }
             _ => Ok(UploadEnd { scan, job: parsed(&row, "job_id")?, duplicate: true }),

@@ -5,9 +5,10 @@ use std::time::Duration;
 use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
+use super::quotas::Addition;
 use super::rows::{count, json, parsed, to_json, word};
 use super::upload_files::blocking;
-use super::{Admission, FreshBlob, NewScan, Seal, StorageError, Store, StoredBlob};
+use super::{Admission, FreshBlob, NewScan, Page, Seal, StorageError, Store, StoredBlob};
 use crate::project::{KeyId, Name, NewUpload, ProjectId, ScanId, Timestamp, Upload, UploadEnd, UploadId};
 
 /// How long after its expiry an upload is remembered, so that its client is told what happened to it.
@@ -27,7 +28,8 @@ impl Store {
         if known.fetch_optional(&mut *tx).await?.is_none() {
             return Err(StorageError::NoProject(new.project));
         }
-        self.check_announcement(&mut tx, new.project, new.sender, new.length).await?;
+        let more = Addition { bytes: new.length, scans: 1, jobs: 1, uploads: 1, announced: None };
+        self.check_quotas(&mut tx, new.project, new.sender, more).await?;
         sqlx::query(
             "INSERT INTO uploads (id, project_id, name, interpretation, metadata, length, created_ms, expires_ms, key_id)
              VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -56,6 +58,25 @@ impl Store {
             .fetch_optional(&self.read)
             .await?;
         row.as_ref().map(upload).transpose()?.ok_or(StorageError::NoUpload(id))
+    }
+
+    /// Uploads of a project that are neither complete nor expired, oldest first, each with its position in the list.
+    pub async fn open_uploads(
+        &self,
+        project: ProjectId,
+        page: Page,
+    ) -> Result<Vec<(i64, Upload)>, StorageError> {
+        let rows = sqlx::query(
+            "SELECT rowid AS position, * FROM uploads WHERE project_id = ? AND scan_id IS NULL AND expires_ms > ?
+               AND rowid > ? ORDER BY rowid LIMIT ?",
+        )
+        .bind(project.to_string())
+        .bind(Timestamp::now().0)
+        .bind(page.after.unwrap_or(0))
+        .bind(page.limit)
+        .fetch_all(&self.read)
+        .await?;
+        rows.iter().map(|row| Ok((row.try_get("position")?, upload(row)?))).collect()
     }
 
     /// Notes that the first `received` bytes are synced, fewer than all, and when the rest is given up.
@@ -111,7 +132,7 @@ impl Store {
         expires: Timestamp,
     ) -> Result<Admission, StorageError> {
         let mut tx = self.begin().await?;
-        let admitted = self.admit(&mut tx, new, Timestamp::now()).await?;
+        let admitted = self.admit(&mut tx, new, Some(id), Timestamp::now()).await?;
         let done = sqlx::query(
             "UPDATE uploads SET received = length, scan_id = ?, job_id = ?, duplicate = ?, expires_ms = ?
              WHERE id = ? AND scan_id IS NULL",

@@ -11,7 +11,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use crate::access::{announce, key};
+use crate::access::{ANNOUNCED, announce, announcement, key};
 use crate::server::{Server, problem, room};
 
 /// Asks for a job on the whole model.
@@ -79,7 +79,8 @@ async fn a_key_has_limits_of_its_own_in_whatever_project() {
     let server = Server::start().await;
     let (one, two) = (server.project().await, server.project().await);
     let bytes = room(0.0).len() as u64;
-    let limits = Limits { bytes: Some(bytes + bytes / 2), scans: None, queued_jobs: Some(1) };
+    let limits =
+        Limits { bytes: Some(bytes + bytes / 2), scans: None, queued_jobs: Some(1), open_uploads: None };
     let (_, token) = key(&server, Scope::Manage, Reach::Everything, limits).await;
     let (_, other) = key(&server, Scope::Manage, Reach::Everything, Limits::default()).await;
     let send = |project: &str, token: &str| {
@@ -101,6 +102,72 @@ async fn a_key_has_limits_of_its_own_in_whatever_project() {
     let answers: Vec<u16> = asked.iter().map(|answer| answer.status().as_u16()).collect();
     assert!(answers.contains(&202) && answers.contains(&429), "{answers:?}");
     assert_eq!(queue(&server, &one, Some(&other)).await.status(), 202);
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_has_begun_as_many_uploads_as_allowed_ends_or_takes_back_one_first() {
+    let server = Server::with(Settings { project_max_open_uploads: Some(2), ..Settings::default() }).await;
+    let (path, other) = (server.project().await, server.project().await);
+    let project = path.rsplit('/').next().unwrap();
+    for _ in 0..2 {
+        assert_eq!(announce(&server, project, None).await.status(), 201);
+    }
+    let refused = announce(&server, project, None).await;
+    assert!(retry_after(&refused) > 0);
+    assert_eq!(problem(refused, 429, "over-quota").await["limit"], 2);
+    assert_eq!(announce(&server, other.rsplit('/').next().unwrap(), None).await.status(), 201);
+    server.accepted(&path, "direct.ply", room(0.0)).await;
+
+    let open = server.json(&format!("{path}/uploads")).await;
+    let open: Vec<&str> =
+        open["items"].as_array().unwrap().iter().map(|u| u["id"].as_str().unwrap()).collect();
+    assert_eq!(open.len(), 2);
+    let page = server.json(&format!("{path}/uploads?limit=1")).await;
+    let rest = format!("{path}/uploads?limit=1&cursor={}", page["next"].as_str().unwrap());
+    assert_eq!(server.json(&rest).await["items"][0]["id"], open[1]);
+    let gone = server.client.delete(server.url(&format!("/v1/uploads/{}", open[0])));
+    assert_eq!(gone.header("tus-resumable", "1.0.0").send().await.unwrap().status(), 204);
+    assert_eq!(announce(&server, project, None).await.status(), 201);
+    assert_eq!(announce(&server, project, None).await.status(), 429);
+
+    server.sql("UPDATE uploads SET expires_ms = 1").await;
+    assert_eq!(server.json(&format!("{path}/uploads")).await["items"], json!([]));
+    assert_eq!(announce(&server, project, None).await.status(), 201, "what has expired counts no more");
+    let limits = Limits { open_uploads: Some(1), ..Limits::default() };
+    let (_, token) = key(&server, Scope::Upload, Reach::Everything, limits).await;
+    assert_eq!(announce(&server, project, Some(&token)).await.status(), 201);
+    let other = announce(&server, other.rsplit('/').next().unwrap(), Some(&token)).await;
+    let body = problem(other, 429, "over-quota").await;
+    assert!(body["detail"].as_str().unwrap().starts_with("the key"), "{body}");
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn bytes_that_were_announced_are_spoken_for_and_those_that_the_disk_cannot_hold_are_refused() {
+    let bytes = room(0.0).len() as u64;
+    let settings = Settings {
+        project_max_bytes: Some(bytes + ANNOUNCED - 1),
+        max_upload_bytes: Some(1 << 45),
+        ..Settings::default()
+    };
+    let server = Server::with(settings).await;
+    let path = server.project().await;
+    let project = path.rsplit('/').next().unwrap();
+    assert_eq!(announce(&server, project, None).await.status(), 201);
+    problem(server.upload(&path, "name=a.ply", room(0.0)).await, 429, "over-quota").await;
+    server.sql("UPDATE uploads SET expires_ms = 1").await;
+    server.accepted(&path, "a.ply", room(0.0)).await;
+    server.stop().await;
+
+    let server = Server::with(Settings { max_upload_bytes: Some(1 << 45), ..Settings::default() }).await;
+    let path = server.project().await;
+    let metadata = announcement(path.rsplit('/').next().unwrap());
+    let vast = server.client.post(server.url("/v1/uploads")).header("tus-resumable", "1.0.0");
+    let vast = vast.header("upload-length", 1_u64 << 45).header("upload-metadata", metadata);
+    let refused = vast.send().await.unwrap();
+    assert!(retry_after(&refused) > 0);
+    problem(refused, 503, "low-disk").await;
     server.stop().await;
 }
 

@@ -12,6 +12,7 @@ mod key_command;
 mod lifecycle;
 mod limits;
 mod metrics;
+mod rates;
 mod restore;
 #[path = "../shared/room.rs"]
 mod room;

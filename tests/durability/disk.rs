@@ -8,6 +8,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{Connection as _, SqliteConnection};
 
 use crate::process::{Faults, Process, check, room, speck, until};
+use crate::tus::Upload;
 
 #[tokio::test]
 async fn a_full_disk_refuses_uploads_and_works_again_when_there_is_space() {
@@ -78,6 +79,73 @@ async fn whichever_write_sync_or_rename_fails_what_was_acknowledged_is_there() {
     }
     service.kill();
     assert_eq!(check(&data, &[]), (0, check(&data, &[]).1));
+}
+
+#[tokio::test]
+async fn a_resumable_upload_on_a_full_disk_keeps_what_is_safe_and_goes_on_when_there_is_space() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let mut service = Process::with(&data, &[], Some(&faults));
+    let project = service.project().await;
+    let bytes = room(0.0);
+    let (mut upload, third) = (Upload::new("a.ply", bytes.clone()), bytes.len() / 3 + 1);
+    let mut go_on = async || upload.go_on(&service.url, &project, third).await.unwrap();
+    assert_eq!(go_on().await, StatusCode::CREATED);
+    assert_eq!(go_on().await, StatusCode::NO_CONTENT);
+    // The bytes themselves, then the note that they are there.
+    for full in ["write enospc 0 /data/uploads/", "write enospc 0 /data/cairn"] {
+        faults.set(full);
+        assert_eq!(go_on().await, StatusCode::INSUFFICIENT_STORAGE, "{full}");
+    }
+    faults.set("");
+    assert_eq!(go_on().await, StatusCode::NO_CONTENT);
+    assert_eq!(go_on().await, StatusCode::NO_CONTENT);
+    let scan = upload.scan.unwrap();
+    let original = reqwest::get(format!("{}{project}/scans/{scan}/original", service.url)).await.unwrap();
+    assert_eq!(original.bytes().await.unwrap(), bytes);
+    service.kill();
+    assert_eq!(check(&data, &[]).0, 0);
+}
+
+#[tokio::test]
+async fn whichever_write_sync_or_rename_fails_a_resumable_upload_loses_nothing_safe_and_ends_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let mut service = Process::with(&data, &[], Some(&faults));
+    let project = service.project().await;
+    let (mut ended, mut refused) = (Vec::new(), BTreeMap::<u16, usize>::new());
+    let kinds =
+        [("write enospc", 14), ("write eio", 14), ("write short", 4), ("sync eio", 12), ("rename eio", 1)];
+    for (kind, calls) in kinds {
+        for n in 0..calls {
+            let bytes = speck(1000 + ended.len());
+            let mut upload = Upload::new("speck.ply", bytes.clone());
+            faults.set(&format!("{kind} {n} /data/"));
+            while upload.scan.is_none() {
+                let status = upload.go_on(&service.url, &project, bytes.len() / 3 + 1).await.unwrap();
+                if !status.is_success() {
+                    *refused.entry(status.as_u16()).or_default() += 1;
+                    faults.set("");
+                    assert!(upload.look(&service.url).await.unwrap().is_success());
+                }
+            }
+            faults.set("");
+            ended.push((upload.scan.unwrap(), bytes));
+        }
+    }
+    assert!(refused.keys().all(|status| [503, 507].contains(status)), "{refused:?}");
+    assert!(refused.values().sum::<usize>() > 20, "{refused:?}");
+    service.kill();
+    let mut service = Process::start(&data);
+    for (scan, bytes) in &ended {
+        let original = reqwest::get(format!("{}{project}/scans/{scan}/original", service.url)).await.unwrap();
+        assert_eq!(original.bytes().await.unwrap(), bytes, "scan {scan}");
+    }
+    let list = service.json(&format!("{project}/scans?limit=200")).await;
+    assert_eq!(list["items"].as_array().unwrap().len(), ended.len(), "each is there once");
+    service.all_ended(&project).await;
+    service.kill();
+    assert_eq!(check(&data, &[]).0, 0);
 }
 
 #[tokio::test]

@@ -1,4 +1,4 @@
-//! `kill -9` at random moments: two rigs upload, jobs run, versions are published, decisions are posted, and readers watch. `CAIRN_KILLS`
+//! `kill -9` at random moments: two rigs upload, one of them in pieces, jobs run, versions are published, decisions are posted, and readers watch. `CAIRN_KILLS`
 //! says how often (10 if it does not).
 
 use std::sync::{Arc, Mutex};
@@ -13,6 +13,7 @@ use tokio::task::JoinHandle;
 
 use crate::process::{Process, check};
 use crate::subjects::{Subject, subjects};
+use crate::tus::Upload;
 
 /// What clients know of a service that lives and dies: where it is just now, and where on it they are at work.
 struct World {
@@ -46,13 +47,33 @@ impl World {
     }
 
     /// A rig uploads every second scan.
-    async fn rig(self: Arc<Self>, first: usize) {
-        for index in (first..self.subjects.len()).step_by(2) {
+    async fn rig(self: Arc<Self>) {
+        for index in (0..self.subjects.len()).step_by(2) {
             let subject = &self.subjects[index];
             let path = format!("/scans?name={}", subject.name);
             let answer = self.insist(&path, || subject.file.clone().into(), false).await;
             self.scans.lock().unwrap()[index] = Some(answer["scan"]["id"].clone());
             tokio::time::sleep(Duration::from_millis(300)).await;
+        }
+    }
+
+    /// A rig on a bad line uploads the others in pieces, and goes on where the service says.
+    async fn slow_rig(self: Arc<Self>) {
+        for index in (1..self.subjects.len()).step_by(2) {
+            let subject = &self.subjects[index];
+            let mut upload = Upload::new(&subject.name, subject.file.clone());
+            while upload.scan.is_none() {
+                let url = self.url.lock().unwrap().clone();
+                let sent = upload.go_on(&url, &self.project, subject.file.len() / 6).await;
+                if !sent.is_ok_and(|status| status.is_success()) {
+                    tokio::time::sleep(Duration::from_millis(50)).await;
+                    let url = self.url.lock().unwrap().clone();
+                    // If this fails as well, the next look tells.
+                    let _ = upload.look(&url).await;
+                }
+                tokio::time::sleep(Duration::from_millis(30)).await;
+            }
+            self.scans.lock().unwrap()[index] = upload.scan.map(Value::from);
         }
     }
 
@@ -166,8 +187,8 @@ impl Round {
             decisions: Mutex::default(),
         });
         let work = vec![
-            tokio::spawn(Arc::clone(&world).rig(0)),
-            tokio::spawn(Arc::clone(&world).rig(1)),
+            tokio::spawn(Arc::clone(&world).rig()),
+            tokio::spawn(Arc::clone(&world).slow_rig()),
             tokio::spawn(Arc::clone(&world).decide()),
         ];
         let reader = tokio::spawn(Arc::clone(&world).read());

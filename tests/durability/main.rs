@@ -11,4 +11,5 @@ mod process;
 #[path = "../shared/room.rs"]
 mod room;
 mod subjects;
+mod tus;
 mod upkeep;

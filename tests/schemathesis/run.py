@@ -4,7 +4,7 @@
     pip install schemathesis requests
     cargo build && tests/schemathesis/run.py target/debug/cairn
 
-Starts the service on a directory of its own with a project, scans, a decision and uploads, then lets schemathesis send requests with
+Starts the service on a directory of its own with a project, scans, a decision, a webhook and uploads, then lets schemathesis send requests with
 made-up ids and with real ones, and requests that follow links. Fails on a 5xx, a status, header, media type or body that the
 description does not have, and on fewer than 5,000 requests.
 """
@@ -44,13 +44,14 @@ def furnish(api: str) -> dict[str, str]:
         requests.get(f"{api}/v1/jobs/{answer['job']['id']}?wait=60")
     ids = [answer["scan"]["id"] for answer in answers]
     decision = requests.post(f"{own}/decisions", json={"verdict": "forbid", "scan_a": ids[0], "scan_b": ids[1]})
+    hook = requests.post(f"{own}/webhooks", json={"url": "https://hooks.example.com/cairn"})
     encode = lambda text: base64.b64encode(text.encode()).decode()
     announced = requests.post(f"{api}/v1/uploads", headers={
         "tus-resumable": "1.0.0", "upload-length": "100000",
         "upload-metadata": f"project {encode(project)},name {encode('a.xyz')}"})
     return {
         "project": project, "scan": ids[2], "job": answers[0]["job"]["id"],
-        "decision": decision.json()["decision"]["id"],
+        "decision": decision.json()["decision"]["id"], "webhook": hook.json()["id"],
         "upload": announced.headers["location"].rsplit("/", 1)[1], "tus-resumable": "1.0.0",
     }
 
@@ -78,7 +79,9 @@ def main() -> None:
     examples = sys.argv[2] if len(sys.argv) > 2 else "60"
     with tempfile.TemporaryDirectory() as folder:
         work = pathlib.Path(folder)
-        service = subprocess.Popen([binary, "serve", "--listen", "127.0.0.1:0", "--data", work / "data"],
+        # One client alone may ask as often as it likes here; messages may be sent to a host that does not exist.
+        service = subprocess.Popen([binary, "serve", "--listen", "127.0.0.1:0", "--data", work / "data",
+                                    "--requests-per-second", "0", "--webhook-hosts", "hooks.example.com"],
                                    stdout=subprocess.PIPE, stderr=open(work / "log", "w"), text=True)
         try:
             api = service.stdout.readline().strip().removeprefix("listening on ")

@@ -16,19 +16,21 @@ const REFUSALS: [(&str, &str, &str); 2] = [
 ];
 
 /// The same of those that bring work.
-const OVERLOAD: [(&str, &str, &str); 3] = [
+const OVERLOAD: [(&str, &str, &str); 2] = [
     ("408", "Stalled", "The body did not come in time"),
-    (
-        "429",
-        "OverQuota",
-        "The project or the key has as much as it may; `retry-after` says when to ask again",
-    ),
     (
         "503",
         "Overloaded",
         "No more work is taken on, or the service is stopping; `retry-after` says when to ask again",
     ),
 ];
+
+/// The refusal that every route may answer with.
+const TOO_MUCH: (&str, &str, &str) = (
+    "429",
+    "TooMuch",
+    "Too many requests come from this address, or the project or the key has as much as it may; `retry-after` says when to ask again",
+);
 
 /// Writes into each operation which scope it needs (`x-cairn-scope`) and how it refuses.
 pub(in crate::http) fn describe(mut api: OpenApi) -> OpenApi {
@@ -39,11 +41,12 @@ pub(in crate::http) fn describe(mut api: OpenApi) -> OpenApi {
         .build();
     let components = api.components.get_or_insert_default();
     components.security_schemes.insert("key".to_owned(), SecurityScheme::Http(scheme).into());
-    for (_, name, meaning) in REFUSALS.into_iter().chain(OVERLOAD) {
+    for (_, name, meaning) in REFUSALS.into_iter().chain(OVERLOAD).chain([TOO_MUCH]) {
         components.responses.insert(name.to_owned(), problem(meaning).into());
     }
     for (template, item) in &mut api.paths.paths {
         for (method, operation) in operations(item) {
+            refuse(operation, &method, &TOO_MUCH);
             match Rule::of(&method, Some(template)) {
                 Rule::Open => operation.security = Some(Vec::new()),
                 Rule::Key(scope, _) => {
@@ -52,19 +55,22 @@ pub(in crate::http) fn describe(mut api: OpenApi) -> OpenApi {
                     let scope = ExtensionsBuilder::new().add("x-cairn-scope", scope.as_str()).build();
                     operation.extensions.get_or_insert_default().merge(scope);
                     let also = if brings_work(&method) { OVERLOAD.as_slice() } else { &[] };
-                    for (status, name, meaning) in REFUSALS.iter().chain(also) {
-                        // An answer to HEAD has no body.
-                        let refusal = match method {
-                            Method::HEAD => Response::new(*meaning).into(),
-                            _ => Ref::from_response_name(*name).into(),
-                        };
-                        operation.responses.responses.entry((*status).to_owned()).or_insert(refusal);
-                    }
+                    REFUSALS.iter().chain(also).for_each(|refusal| refuse(operation, &method, refusal));
                 }
             }
         }
     }
     api
+}
+
+/// Adds a refusal to the answers of an operation that does not describe it itself.
+fn refuse(operation: &mut Operation, method: &Method, (status, name, meaning): &(&str, &str, &str)) {
+    // An answer to HEAD has no body.
+    let refusal = match *method {
+        Method::HEAD => Response::new(*meaning).into(),
+        _ => Ref::from_response_name(*name).into(),
+    };
+    operation.responses.responses.entry((*status).to_owned()).or_insert(refusal);
 }
 
 fn problem(meaning: &str) -> Response {

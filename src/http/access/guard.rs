@@ -6,8 +6,8 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
-use super::Caller;
 use super::rules::{Rule, Subject};
+use super::{Caller, Source};
 use crate::http::extract::no_id;
 use crate::http::{Api, Problem};
 use crate::project::{JobId, ProjectId, Token, UploadId};
@@ -23,7 +23,17 @@ pub(in crate::http) async fn guard(State(api): State<Api>, request: Request, nex
             }
             next.run(Request::from_parts(parts, body)).await
         }
-        Err(problem) => problem.into_response(),
+        Err(problem) => refused(&api, &parts, problem).into_response(),
+    }
+}
+
+/// The refusal of a request; of those with keys that open nothing too many from one address are another one.
+fn refused(api: &Api, parts: &Parts, problem: Problem) -> Problem {
+    let failed =
+        problem.status == StatusCode::UNAUTHORIZED && parts.headers.contains_key(header::AUTHORIZATION);
+    match parts.extensions.get::<Source>().filter(|_| failed) {
+        Some(source) => api.access.rates.count_failure(*source).err().unwrap_or(problem),
+        None => problem,
     }
 }
 

@@ -43,7 +43,9 @@ async fn has_room(api: &Api) -> Result<(), Problem> {
     has_space(api)?;
     let most = api.access.load.open_jobs;
     if api.store.open_jobs(most).await? >= most {
-        return Err(refusal("queue-full", "the service has as many jobs waiting as it takes on"));
+        let detail = "the service has as many jobs waiting as it takes on";
+        let refusal = Problem::new(StatusCode::SERVICE_UNAVAILABLE, "queue-full", detail);
+        return Err(Problem { retry_after: RETRY_AFTER, ..refusal });
     }
     Ok(())
 }
@@ -51,11 +53,7 @@ async fn has_room(api: &Api) -> Result<(), Problem> {
 /// Fails if the disk is nearly full.
 pub(in crate::http) fn has_space(api: &Api) -> Result<(), Problem> {
     if api.store.free_bytes()? < api.access.load.free_bytes {
-        return Err(refusal("low-disk", "the service has too little space left to take anything in"));
+        return Err(Problem::low_disk());
     }
     Ok(())
-}
-
-fn refusal(word: &str, detail: &str) -> Problem {
-    Problem { retry_after: RETRY_AFTER, ..Problem::new(StatusCode::SERVICE_UNAVAILABLE, word, detail) }
 }

@@ -19,11 +19,11 @@ use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use futures_util::StreamExt;
 use tracing::Instrument;
 
 use super::problem::Problem;
 use super::router::Api;
+use crate::jobs::Pace;
 use crate::project::Timestamp;
 use crate::storage::Answer;
 
@@ -157,13 +157,13 @@ fn given(kept: Answer) -> Result<Response, Problem> {
 /// Reads a body that is not needed, under the limits of an upload, for its hash.
 async fn of_body(api: &Api, mut hasher: blake3::Hasher, body: Body) -> Result<[u8; 32], Problem> {
     let (limit, idle) = (api.resumable.max_bytes(), api.resumable.idle());
-    let (mut pieces, mut bytes) = (body.into_data_stream(), 0);
+    let (mut pieces, mut bytes, mut pace) = (body.into_data_stream(), 0, Pace::new(idle));
     loop {
-        let next = tokio::time::timeout(idle, pieces.next()).await.map_err(|_| {
+        let next = pace.next(&mut pieces).await.map_err(|_| {
             Problem::new(
                 StatusCode::REQUEST_TIMEOUT,
                 "upload-stalled",
-                "no byte of the body came for too long",
+                "nearly nothing of the body came for too long",
             )
         })?;
         let Some(piece) = next else { return Ok(*hasher.finalize().as_bytes()) };

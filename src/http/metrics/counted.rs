@@ -105,6 +105,11 @@ impl Metrics {
         self.upload_bytes.inc_by(bytes);
     }
 
+    /// Counts a connection that was not taken because its address has as many as it may.
+    pub fn turned_away(&self) {
+        self.rejections.get_or_create(&[("reason", "too-many-connections".to_owned())]).inc();
+    }
+
     /// Counts the jobs that have ended since the last call, each once.
     pub(super) async fn catch_up(&self, store: &Store) -> Result<(), StorageError> {
         let mut jobs = self.jobs.lock().await;

@@ -37,6 +37,18 @@ pub(super) async fn registry(store: &Store) -> Result<Registry, StorageError> {
             figures.scan_bytes,
         ),
         ("disk_free", "Bytes that are free where the data are", Some(Unit::Bytes), disk),
+        (
+            "open_uploads",
+            "Resumable uploads that are neither complete nor expired",
+            None,
+            figures.open_uploads,
+        ),
+        (
+            "open_uploads_received",
+            "Bytes of open resumable uploads that have come",
+            Some(Unit::Bytes),
+            figures.open_upload_bytes,
+        ),
         ("projects", "Projects", None, figures.projects),
         ("models", "Projects whose model is not empty", None, figures.models),
         ("model_versions", "Versions of models that can be read", None, figures.versions),

@@ -35,4 +35,5 @@ pub(super) fn routes() -> OpenApiRouter<Api> {
             version::describe_upload
         ))
         .layer(map_response(version::speak))
+        .routes(routes!(show::list_uploads))
 }

@@ -1,4 +1,5 @@
-//! `HEAD`, `GET` and `DELETE /v1/uploads/{u}`: how far an upload is, what became of it, and taking it back.
+//! `HEAD`, `GET` and `DELETE /v1/uploads/{u}`: how far an upload is, what became of it, and taking it back. `GET /v1/projects/{p}/uploads`:
+//! which are not complete.
 
 use axum::Json;
 use axum::extract::State;
@@ -14,6 +15,7 @@ use crate::http::extract::Ids;
 use crate::http::job::JobBody;
 use crate::http::link::Link;
 use crate::http::problem::{Problem, Problems};
+use crate::http::query::{Params, cursor};
 use crate::http::router::Api;
 use crate::http::scan::ScanBody;
 use crate::project::{Name, ProjectId, Timestamp, Upload, UploadId};
@@ -51,6 +53,55 @@ pub(super) struct ResumableBody {
     links: Vec<Link>,
 }
 
+/// A part of the list of uploads.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct ResumableList {
+    /// Oldest first.
+    items: Vec<ResumableBody>,
+    /// The `cursor` of the next part, if there is one.
+    next: Option<String>,
+}
+
+impl ResumableBody {
+    fn new(upload: Upload, scan: Option<ScanBody>, job: Option<JobBody>) -> Self {
+        let Upload { id, announced, received, end, created, expires, .. } = upload;
+        let project = format!("/v1/projects/{}", announced.project);
+        Self {
+            id,
+            project: announced.project,
+            name: announced.name,
+            length: announced.length,
+            offset: received,
+            created,
+            expires,
+            scan,
+            job,
+            duplicate: end.map(|end| end.duplicate),
+            links: vec![Link::new("self", format!("/v1/uploads/{id}")), Link::new("project", project)],
+        }
+    }
+}
+
+/// Lists the uploads into a project that are neither complete nor expired. Who may send scans may take them back.
+#[utoipa::path(get, path = "/v1/projects/{project}/uploads", tag = "uploads", params(
+    ("project" = String, Path, description = "Id of the project"),
+    ("cursor" = Option<String>, Query, description = "The `next` of an earlier answer", pattern = "^[0-9a-f]{1,15}$"),
+    ("limit" = Option<u32>, Query, description = "At most so many items, 1 to 200; 50 if absent", minimum = 1, maximum = 200)),
+    responses((status = 200, description = "A part of the list", body = ResumableList), Problems))]
+pub(in crate::http) async fn list_uploads(
+    State(api): State<Api>,
+    Ids(project): Ids<ProjectId>,
+    mut query: Params,
+) -> Result<Json<ResumableList>, Problem> {
+    let page = query.page()?;
+    query.finish()?;
+    api.store.project(project).await?;
+    let found = api.store.open_uploads(project, page).await?;
+    let next = found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at));
+    let items = found.into_iter().map(|(_, upload)| ResumableBody::new(upload, None, None)).collect();
+    Ok(Json(ResumableList { items, next }))
+}
+
 /// Shows how far an upload is, without disturbing who writes to it, and what became of it.
 #[utoipa::path(get, path = "/v1/uploads/{upload}", tag = "uploads",
     params(("upload" = String, Path, description = "Id of the upload")), responses(
@@ -62,31 +113,17 @@ pub(super) async fn get_upload(
     Ids(id): Ids<UploadId>,
 ) -> Result<Json<ResumableBody>, Problem> {
     let upload = api.resumable.peek(id).await?;
-    let Upload { announced, received, end, created, expires, .. } = upload;
-    let (scan, job) = match end {
+    let (scan, job) = match upload.end {
         None => (None, None),
         Some(end) => {
-            let scan = match api.store.scan(announced.project, end.scan).await {
+            let scan = match api.store.scan(upload.announced.project, end.scan).await {
                 Err(StorageError::NoScan(_)) => None,
                 other => Some(other?.into()),
             };
             (scan, Some(api.store.job(end.job).await?.into()))
         }
     };
-    let project = format!("/v1/projects/{}", announced.project);
-    Ok(Json(ResumableBody {
-        id,
-        project: announced.project,
-        name: announced.name,
-        length: announced.length,
-        offset: received,
-        created,
-        expires,
-        scan,
-        job,
-        duplicate: end.map(|end| end.duplicate),
-        links: vec![Link::new("self", format!("/v1/uploads/{id}")), Link::new("project", project)],
-    }))
+    Ok(Json(ResumableBody::new(upload, scan, job)))
 }
 
 /// Says where an upload goes on. A request that still writes to it is asked to end first, so that the answer stays true.
@@ -106,7 +143,10 @@ pub(super) async fn get_upload(
     (status = 410, description = "The upload has expired"),
     (status = 412, description = "Another version of tus is spoken here"),
     (status = 423, description = "Another request is finishing the upload"),
-    (status = 500, description = "The service failed")))]
+    (status = 429, description = "The upload is complete, but the project or the key has as much as it may"),
+    (status = 500, description = "The service failed"),
+    (status = 503, description = "Its files or its database cannot be used just now"),
+    (status = 507, description = "It has no space left")))]
 pub(super) async fn head_upload(
     _: Tus,
     State(api): State<Api>,
