@@ -29,7 +29,8 @@ EXPOSE 8080
 # SIGTERM shuts down softly: jobs that are not done are given back to the queue. `docker stop -t 40` gives it the time; being
 # killed earlier loses nothing either.
 STOPSIGNAL SIGTERM
-# bash is in the base image and can open the socket itself.
+# bash is in the base image and can open the socket itself. It asks without TLS at port 8080: where settings say otherwise, give
+# `--no-healthcheck` or a check of your own.
 HEALTHCHECK --interval=30s --timeout=5s --start-period=10s \
     CMD ["bash", "-c", "exec 3<>/dev/tcp/127.0.0.1/8080 && printf 'GET /readyz HTTP/1.0\\r\\n\\r\\n' >&3 && read -r _ status _ <&3 && [ \"$status\" = 200 ]"]
 ENTRYPOINT ["cairn"]
