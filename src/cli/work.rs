@@ -65,14 +65,20 @@ pub fn run(args: &WorkArgs) -> anyhow::Result<ExitCode> {
             Ok(store) => store,
             Err(error) => {
                 tracing::error!(%error, "no job can begin");
-                return Ok(ExitCode::from(NOT_NOW));
+                return ExitCode::from(NOT_NOW);
             }
         };
-        work_for_service(store, compute, config.workers, orders, tell).await.map(|()| ExitCode::SUCCESS)
+        match work_for_service(store, compute, config.workers, orders, tell).await {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                tracing::debug!(%error, "the service is gone, and nobody hears that a job is done");
+                ExitCode::from(NOT_NOW)
+            }
+        }
     });
     // A thread that does not stop is left behind.
     runtime.shutdown_timeout(Duration::ZERO);
-    Ok(worked?)
+    Ok(worked)
 }
 
 /// Makes this process a session of its own. Linux shares the processor out by sessions first: in that of the service, what is computed

@@ -8,6 +8,7 @@ mod kill;
 mod once;
 mod poison;
 mod process;
+mod resident;
 #[path = "../shared/room.rs"]
 mod room;
 mod subjects;

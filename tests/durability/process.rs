@@ -49,6 +49,11 @@ impl Process {
         self.child.wait().unwrap();
     }
 
+    /// What the system calls it.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Whether it has ended by itself.
     pub fn has_died(&mut self) -> bool {
         self.child.try_wait().unwrap().is_some()

@@ -57,7 +57,7 @@ pub struct Isolated {
 }
 
 /// How long a process may take to let go of a job that was dismissed. After that it is killed, so dismissal never takes longer.
-const LETTING_GO: Duration = Duration::from_millis(500);
+const LETTING_GO: Duration = Duration::from_millis(300);
 /// How much longer than its time a job may take until its process is killed, which stops by itself if it can.
 const STOPPING: Duration = Duration::from_secs(2);
 
