@@ -71,7 +71,7 @@ async fn a_dismissed_job_lets_go_of_its_worker_wherever_it_is() {
     }
     taken.sort();
     println!(
-        "{scans} scans, whose rebuild takes {whole:.1} s; the model was let go after (the longest last): {taken:?}"
+        "{scans} scans, whose rebuild takes {whole:.1} s; the next job began after (the longest last): {taken:?}"
     );
     assert_eq!(service.ended(&job).await["status"], "succeeded", "the model is none the worse");
     assert!(!service.has_died());
