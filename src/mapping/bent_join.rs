@@ -3,13 +3,16 @@
 use super::candidates::{Candidate, support_of};
 use super::component::Component;
 use super::consistency::thrown;
-use super::join::{ViolationLimit, pooled_fit, violation_of};
+use super::join::{SINGLE_STARTS, ViolationLimit, pooled_fit, violation_of};
 use super::options::{JoinLevel, MappingOptions};
-use super::refine::{dense, pose_graph};
+use super::refine::{Reach, dense, pose_graph};
 use super::surfaces::judge;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
 use crate::graph::ScanGraph;
+
+/// What was bent may keep this many times the violation that a straight join may show. Wrong joins show more than twice as much.
+const LENIENCE: f64 = 1.5;
 
 /// A join of two components that are each a little bent, so that no rigid motion fits all that they share: they are joined on
 /// trial, adjusted together, and judged as they then stand. `None` when that does not help, or when another pose is nearly as well supported.
@@ -26,10 +29,10 @@ pub fn bent_join(
         return Ok(None);
     }
     let mut joined = a.clone();
-    joined.absorb(b.clone(), &pooled_fit(graph, a, b, candidate, voxel), graph, options);
+    joined.absorb(b.clone(), &clearest_start(graph, (a, b), candidate, voxel), graph, options);
     let before = joined.clone();
-    pose_graph(graph, &mut joined, voxel, options, control)?;
-    dense(graph, &mut joined, None, voxel, control)?;
+    pose_graph(graph, &mut joined, Reach::FAR, voxel, options, control)?;
+    dense(graph, &mut joined, None, Reach::FAR, voxel, control)?;
     if !thrown(graph, &before, &joined, options).is_empty() {
         return Ok(None);
     }
@@ -43,5 +46,26 @@ pub fn bent_join(
     let limit = ViolationLimit::new(graph, (a, b), candidate.support, level, options);
     let banned = options.decisions.forbids(graph, &x, &y, &Pose::identity(), options);
     let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
-    Ok((!banned && limit.admits(found) && kept >= level.support).then_some(joined))
+    Ok((!banned && found <= LENIENCE * limit.share() && kept >= level.support).then_some(joined))
+}
+
+/// Of the fit to all edges and the poses of single edges, the one that is most clear of free space. The fit lies where the adjustment
+/// cannot return from when the edges differ by more than they are wide.
+fn clearest_start(
+    graph: &ScanGraph,
+    (a, b): (&Component, &Component),
+    candidate: &Candidate,
+    voxel: f64,
+) -> Pose {
+    let violation = |pose: &Pose| violation_of(&judge(graph, a, b, pose));
+    let fit = pooled_fit(graph, a, b, candidate, voxel);
+    let single = candidate.members.iter().take(SINGLE_STARTS).map(|member| member.a_from_b);
+    let mut best = (violation(&fit), fit);
+    for start in single {
+        let found = violation(&start);
+        if found < best.0 {
+            best = (found, start);
+        }
+    }
+    best.1
 }

@@ -208,7 +208,7 @@ const NO_SUPPORT: f64 = 1e-6;
 /// A pair says that much by itself (softplus of its log-odds) when it counts as a witness: a likelihood of 0.86.
 const WITNESS: f64 = 2.0;
 /// A pair speaks against a component only if its pose differs by this many times what makes a rival.
-const CLEARLY_DIFFERENT: f64 = 2.0;
+pub const CLEARLY_DIFFERENT: f64 = 2.0;
 /// A component is contradicted when what is said against it, beyond a witness's least, comes to this for each witness for it …
 const CONTRADICTED_WEIGHT: f64 = 0.05;
 /// … and at least to this, …
@@ -221,6 +221,8 @@ const CONTRADICTED_PAIRS: usize = 2;
 pub struct Contradiction {
     /// Which pair.
     pub pair: PairKey,
+    /// The other pose, between the local frames of the pair's scans.
+    pub a_from_b: Pose,
     /// softplus of the log-odds of the other pose, by the pair alone.
     pub evidence: f64,
     /// Angle between the two poses, radians.
@@ -283,7 +285,8 @@ pub fn testimony(graph: &ScanGraph, component: &Component, options: &MappingOpti
                     || distance > CLEARLY_DIFFERENT * reach)
                     && other.is_none_or(|known| evidence > known.evidence)
                 {
-                    other = Some(Contradiction { pair: edge.pair, evidence, angle, distance });
+                    let a_from_b = h.hypothesis.a_from_b;
+                    other = Some(Contradiction { pair: edge.pair, a_from_b, evidence, angle, distance });
                 }
             }
             match other {

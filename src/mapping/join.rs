@@ -21,7 +21,7 @@ const FIRM_LENIENCE: f64 = 1.5;
 /// Of the points that are near the other side, at most this share may face another way. Right joins of components show up to 0.3.
 const MAX_WRONG_NORMAL: f64 = 0.38;
 /// Edges whose own poses are tried where the fit to all of them fails.
-const SINGLE_STARTS: usize = 6;
+pub const SINGLE_STARTS: usize = 6;
 
 /// Why a join was not made.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

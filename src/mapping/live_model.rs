@@ -10,7 +10,7 @@ use super::decision::{Decision, Decisions};
 use super::mapper::Mapper;
 use super::options::MappingOptions;
 use super::policy::grow;
-use super::refine::{dense, global_bundle_adjustment, held_out};
+use super::refine::{Reach, dense, global_bundle_adjustment, held_out};
 use super::snapshot::{ComponentSnapshot, ModelSnapshot, RegisteredScan, ScanOutcome};
 use super::track_refinement::refine_tracks;
 use crate::cloud::ScanKey;
@@ -157,7 +157,7 @@ impl LiveModel {
     /// Joint dense refinement over all overlapping pairs.
     pub fn dense_refinement(&mut self, control: Control<'_>) -> Result<RefinementReport, Cancelled> {
         self.improve(Stage::DenseRefinement, control, |graph, component, voxel, _| {
-            Ok(dense(graph, component, None, voxel, control)?.and_then(|outcome| outcome.last))
+            Ok(dense(graph, component, None, Reach::NEAR, voxel, control)?.and_then(|outcome| outcome.last))
         })
     }
 

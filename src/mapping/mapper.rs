@@ -11,8 +11,9 @@ use super::join::{Refusal, weigh_join};
 use super::next_scan::visible_landmarks;
 use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
-use super::refine::{dense, local_bundle_adjustment, neighborhood, pose_graph};
+use super::refine::{Reach, dense, local_bundle_adjustment, neighborhood, pose_graph};
 use super::snapshot::WaitingReason;
+use super::surfaces::judge_inside;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::{Retrieval, ScanGraph};
@@ -107,7 +108,7 @@ impl Mapper {
                         local_bundle_adjustment(component, next.scan, voxel, options, control)
                     })?;
                     guarded(graph, component, options, |component| {
-                        dense(graph, component, Some(&free), voxel, control).map(drop)
+                        dense(graph, component, Some(&free), Reach::NEAR, voxel, control).map(drop)
                     })?;
                     self.joins_since_refinement += 1;
                     return Ok(Some(next.scan));
@@ -283,7 +284,7 @@ impl Mapper {
         Ok(pairs)
     }
 
-    /// Refines every component that grew: pose graph, then joint dense adjustment, then tracks at the new poses.
+    /// Refines every component that grew, then its tracks at the new poses.
     pub fn refine(
         &mut self,
         graph: &ScanGraph,
@@ -292,12 +293,7 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
         for component in &mut self.components {
-            guarded(graph, component, options, |component| {
-                pose_graph(graph, component, voxel, options, control)
-            })?;
-            guarded(graph, component, options, |component| {
-                dense(graph, component, None, voxel, control).map(drop)
-            })?;
+            *component = refined(graph, component, voxel, options, control)?;
             component.tracks.filter(&component.poses, options.track_voxels * voxel, options.track_length);
         }
         self.joins_since_refinement = 0;
@@ -418,6 +414,35 @@ impl Mapper {
             self.add_waiting(scan);
         }
     }
+}
+
+/// A component after the pose graph and the joint dense adjustment, or after the dense adjustment alone where that leaves less in free
+/// space: edges of little overlap all slide the same way, and a pose graph of such edges bends what was straight.
+fn refined(
+    graph: &ScanGraph,
+    component: &Component,
+    voxel: f64,
+    options: &MappingOptions,
+    control: Control<'_>,
+) -> Result<Component, Cancelled> {
+    let violation = |component: &Component| judge_inside(graph, component).violation_share();
+    let on_surfaces = |mut component: Component| {
+        guarded(graph, &mut component, options, |component| {
+            dense(graph, component, None, Reach::NEAR, voxel, control).map(drop)
+        })?;
+        Ok(component)
+    };
+    let mut spread = component.clone();
+    guarded(graph, &mut spread, options, |component| {
+        pose_graph(graph, component, Reach::NEAR, voxel, options, control)
+    })?;
+    let spread = on_surfaces(spread)?;
+    let bent = violation(&spread);
+    if bent <= violation(component) {
+        return Ok(spread);
+    }
+    let alone = on_surfaces(component.clone())?;
+    Ok(if violation(&alone) < bent { alone } else { spread })
 }
 
 /// Runs an adjustment and takes it back if it throws a scan off its edges.

@@ -21,17 +21,31 @@ use crate::pairwise::centred_difference;
 
 /// Points of each scan in each overlapping pair of a dense adjustment.
 pub const DENSE_POINTS: usize = 1000;
-/// Gates of the dense adjustment in voxels, and of its held-out measure.
-const DENSE_GATES_VOXELS: (f64, f64) = (4.0, 1.6);
+/// Last gate of the dense adjustment in voxels, and gate of its held-out measure.
+const LAST_GATE_VOXELS: f64 = 1.6;
 pub const HELD_OUT_GATE_VOXELS: f64 = 2.0;
-/// Scale at which the pose graph believes an edge, in voxels.
-const POSE_GRAPH_VOXELS: f64 = 1.6;
 /// Scale of the robust loss on landmark distances, in voxels.
 const LANDMARK_KERNEL_VOXELS: f64 = 1.0;
 /// Rounds of adjust, complete, merge, filter in a global bundle adjustment …
 const GLOBAL_ROUNDS: usize = 5;
 /// … until fewer than this share of the observations change.
 const CHANGED_SHARE: f64 = 0.0005;
+
+/// How far from right an adjustment expects the poses to be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reach {
+    /// Scale at which the pose graph believes an edge, in voxels.
+    pose_graph_voxels: f64,
+    /// First gate of the dense adjustment, in voxels.
+    first_gate_voxels: f64,
+}
+
+impl Reach {
+    /// A little off, as a model is that only grew.
+    pub const NEAR: Self = Self { pose_graph_voxels: 1.6, first_gate_voxels: 4.0 };
+    /// Bent by accumulated errors of edges, each small: edges share them out instead of breaking at one.
+    pub const FAR: Self = Self { pose_graph_voxels: 8.0, first_gate_voxels: 10.0 };
+}
 
 /// The scans of a component by index, as the optimisers count them.
 struct Indexed {
@@ -182,6 +196,7 @@ pub fn adjust_landmarks(
 pub fn pose_graph(
     graph: &ScanGraph,
     component: &mut Component,
+    reach: Reach,
     voxel: f64,
     options: &MappingOptions,
     control: Control<'_>,
@@ -212,7 +227,7 @@ pub fn pose_graph(
     }
     let gauge = component.gauge;
     let held = indexed.held_but(|key| *key != gauge);
-    let settings = PoseGraphOptions::with_final_scale(POSE_GRAPH_VOXELS * voxel);
+    let settings = PoseGraphOptions::with_final_scale(reach.pose_graph_voxels * voxel);
     match adjust_pose_graph(&indexed.poses, &edges, &held, &settings, control) {
         Ok(adjusted) => write_back(component, &indexed.keys, &adjusted.poses),
         Err(PoseGraphError::Minimise(MinimiseError::Cancelled(cancelled))) => return Err(cancelled),
@@ -241,6 +256,7 @@ pub fn dense(
     graph: &ScanGraph,
     component: &mut Component,
     free: Option<&[ScanKey]>,
+    reach: Reach,
     voxel: f64,
     control: Control<'_>,
 ) -> Result<Option<DenseOutcome>, Cancelled> {
@@ -251,7 +267,7 @@ pub fn dense(
     let gauge = component.gauge;
     let held = indexed.held_but(|key| *key != gauge && is_free(key));
     let tracks = indexed.tracks(component, |observations| observations.iter().any(|o| is_free(&o.scan)));
-    let settings = DenseOptions::with_gates(DENSE_GATES_VOXELS.0 * voxel, DENSE_GATES_VOXELS.1 * voxel);
+    let settings = DenseOptions::with_gates(reach.first_gate_voxels * voxel, LAST_GATE_VOXELS * voxel);
     let problem = DenseProblem { poses: &indexed.poses, held: &held, surfaces: &surfaces, tracks: &tracks };
     match adjust_dense(&problem, &settings, control) {
         Ok(adjusted) => {

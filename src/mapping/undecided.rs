@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 
 use super::candidates::{CLUSTERS, candidates};
 use super::component::Component;
-use super::consistency::{Contradiction, Testimony};
+use super::consistency::{CLEARLY_DIFFERENT, Contradiction, Testimony};
 use super::join::{Refusal, weigh_join};
 use super::options::{JoinLevel, MappingOptions};
 use crate::cloud::ScanKey;
@@ -74,7 +74,13 @@ fn reweigh(
 ) -> Option<bool> {
     // What is joined already need show no least support; a rival may have its share of it, however firm it is.
     let level = JoinLevel { support: 0.0, ..*options.levels.last()? };
-    let options = MappingOptions { rival_share: 1.0 / NEARLY_AS_GOOD, ..options.clone() };
+    // A pose nearby is no other place.
+    let options = MappingOptions {
+        rival_share: 1.0 / NEARLY_AS_GOOD,
+        rival_angle: CLEARLY_DIFFERENT * options.rival_angle,
+        rival_voxels: CLEARLY_DIFFERENT * options.rival_voxels,
+        ..options.clone()
+    };
     let mut rest = component.clone();
     let part = rest.split_off(side, &options)?;
     let model_from = |piece: &Component| {
