@@ -63,7 +63,8 @@ pub(super) struct UndoneBody {
     scans: Vec<NamedScan>,
     /// The loop that proved it: edges that each stand on their own but do not close; it begins and ends at one scan.
     evidence: Vec<NamedScan>,
-    /// How far the loop fails to close, degrees.
+    /// How far the loop fails to close, degrees. This and the distance are zero where no pair is for another place, but the ends of the
+    /// path stand in each other's free space.
     angle_deg: f64,
     /// How far the loop fails to close, metres.
     distance: f64,

@@ -13,6 +13,7 @@ mod consistency;
 mod decision;
 mod filter;
 mod initial_pair;
+mod intrusion;
 mod join;
 mod live_model;
 mod mapper;

@@ -3,8 +3,8 @@
 //! At each level of strictness, strictest first: register the next scan into a component; else merge two components; else start
 //! a component from an initial pair. Any success goes back to the strictest level, because the model has grown and what waited may
 //! now be well supported. When nothing fits, misplaced scans are filtered and tried again, and retrieval widens for what stays apart.
-//! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. What
-//! is left then waits.
+//! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. Where
+//! alike places were found, none but firm ones are made at all. What is left then waits.
 
 use std::collections::BTreeSet;
 
@@ -50,7 +50,7 @@ pub fn grow(
         if !fresh.is_empty() {
             rounds += 1;
             pairs.extend(graph.try_pairs(&fresh, &options.support, control)?);
-        } else if levels.len() < options.levels.len() {
+        } else if levels.len() < options.levels.len() && mapper.doubted.is_empty() {
             levels.clone_from(&options.levels);
         } else {
             break;

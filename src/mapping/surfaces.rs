@@ -9,7 +9,7 @@ use crate::features::Scan;
 use crate::geometry::{Point, Pose};
 use crate::graph::ScanGraph;
 use crate::optimize::{Correspondence, Correspondences};
-use crate::pairwise::{Counts, look, perturbed_about, quick_overlap};
+use crate::pairwise::{Counts, PairKey, look, perturbed_about, quick_overlap};
 
 /// Cosine by which normals of corresponding points agree at least.
 const MIN_NORMAL_DOT: f32 = 0.5;
@@ -201,6 +201,12 @@ pub fn judge(graph: &ScanGraph, a: &Component, b: &Component, a_from_b: &Pose) -
 /// What all pairs of scans inside a component say of its poses: how much its own data violate free space where nothing is wrong.
 #[must_use]
 pub fn judge_inside(graph: &ScanGraph, component: &Component) -> Counts {
+    judge_each(graph, component).iter().fold(Counts::default(), |sum, (_, counts)| sum.plus(counts))
+}
+
+/// What each pair of scans of a component that can share anything says of its poses, over both directions.
+#[must_use]
+pub fn judge_each(graph: &ScanGraph, component: &Component) -> Vec<(PairKey, Counts)> {
     let members: Vec<(&Scan, Pose)> =
         component.poses.iter().filter_map(|(key, pose)| Some((graph.scan(*key)?.as_ref(), *pose))).collect();
     let pairs: Vec<(usize, usize)> =
@@ -211,16 +217,11 @@ pub fn judge_inside(graph: &ScanGraph, component: &Component) -> Counts {
         .map(|&(i, j)| {
             let ((x, x_pose), (y, y_pose)) = (&members[i], &members[j]);
             let x_from_y = x_pose.inverse() * *y_pose;
-            look(x, y, &x_from_y, stride(y, INSIDE_POINTS)).plus(&look(
-                y,
-                x,
-                &x_from_y.inverse(),
-                stride(x, INSIDE_POINTS),
-            ))
+            let there = look(x, y, &x_from_y, stride(y, INSIDE_POINTS));
+            let back = look(y, x, &x_from_y.inverse(), stride(x, INSIDE_POINTS));
+            (PairKey::of(x.key(), y.key()), there.plus(&back))
         })
-        .collect::<Vec<_>>()
-        .iter()
-        .fold(Counts::default(), |sum, counts| sum.plus(counts))
+        .collect()
 }
 
 /// The overlapping pairs of one component as the joint dense adjustment reads them.

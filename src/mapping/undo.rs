@@ -1,5 +1,5 @@
-//! Taking back what later evidence contradicts. Where the pairs that speak against a component all speak against one join in it, that
-//! join is undone and its pose is not tried again; where they are too many for that, alike places were folded onto each other: nothing
+//! Taking back what later evidence contradicts. Where the pairs that speak against a component all speak against one join in it, or its
+//! sides turn out to stand in each other's free space, that join is undone and its pose is not tried again; where they are too many for that, alike places were folded onto each other: nothing
 //! there can be told from its twin, so nothing is kept, and the scans wait until a new scan or a decision changes what is known.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -10,6 +10,7 @@ use super::candidates::best_candidate;
 use super::component::Component;
 use super::consistency::{Contradiction, Testimony, separating_cut, supports, testimony};
 use super::decision::{Decision, between_own_frames};
+use super::intrusion::{Intrusion, intrusion};
 use super::join::Refusal;
 use super::mapper::Mapper;
 use super::open_join::Undone;
@@ -59,7 +60,7 @@ impl Mapper {
             }
             let supports = supports(graph, &component, options);
             let testimony = testimony(graph, &self.with_torn(graph, &component, voxel, options), options);
-            match finding(graph, &component, &supports, &testimony, voxel, options) {
+            match finding(graph, &component, &supports, &testimony, voxel, options, control)? {
                 Finding::Sound => self.components.push(component),
                 Finding::Folded { strongest } => {
                     self.undone.push(record(
@@ -101,18 +102,25 @@ fn finding(
     testimony: &Testimony,
     voxel: f64,
     options: &MappingOptions,
-) -> Finding {
+    control: Control<'_>,
+) -> Result<Finding, Cancelled> {
     if let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) {
-        return Finding::Folded { strongest: *strongest };
+        return Ok(Finding::Folded { strongest: *strongest });
     }
     if let Some((side, strongest)) = tear(graph, component, supports, testimony, options) {
-        return Finding::Torn { side, strongest };
+        return Ok(Finding::Torn { side, strongest });
     }
     match undecided(graph, component, testimony, voxel, options) {
-        Some(Undecided { strongest, rivals: true, .. }) => Finding::Folded { strongest },
-        Some(Undecided { side, strongest, .. }) => Finding::Torn { side, strongest },
-        None => Finding::Sound,
+        Some(Undecided { strongest, rivals: true, .. }) => return Ok(Finding::Folded { strongest }),
+        Some(Undecided { side, strongest, .. }) => return Ok(Finding::Torn { side, strongest }),
+        None => {}
     }
+    Ok(match intrusion(graph, component, supports, options, control)? {
+        Some(Intrusion { side, shown_by }) => {
+            Finding::Torn { side: smaller_side(component, side), strongest: shown_by }
+        }
+        None => Finding::Sound,
+    })
 }
 
 /// Where a component comes apart: the cut between two contradicting scans that holds least compared with what speaks against it, by its

@@ -44,7 +44,8 @@ pub struct Undone {
     pub scans: Vec<ScanId>,
     /// The loop that proved it: edges that each stand on their own but do not close; it begins and ends at one scan.
     pub evidence: Vec<ScanId>,
-    /// How far the loop fails to close: radians.
+    /// How far the loop fails to close: radians. This and the distance are zero where no pair is for another place, but the ends of the
+    /// path stand in each other's free space.
     pub angle: f64,
     /// How far the loop fails to close: metres.
     pub distance: f64,

@@ -115,12 +115,12 @@ impl OpenJoinReport {
 impl UndoneReport {
     /// In a line for people.
     pub fn line(&self) -> String {
-        format!(
-            "taken back: {} scans, because {} does not close by {:.1} deg and {:.2} m",
-            self.scans.len(),
-            self.evidence.join(" - "),
-            self.angle_deg,
-            self.distance
-        )
+        let path = self.evidence.join(" - ");
+        let proof = if self.angle_deg > 0.0 || self.distance > 0.0 {
+            format!("{path} does not close by {:.1} deg and {:.2} m", self.angle_deg, self.distance)
+        } else {
+            format!("{path} puts scans into each other's free space")
+        };
+        format!("taken back: {} scans, because {proof}", self.scans.len())
     }
 }
