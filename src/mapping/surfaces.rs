@@ -6,10 +6,10 @@ use rayon::prelude::*;
 use super::component::Component;
 use crate::cloud::ScanKey;
 use crate::features::Scan;
-use crate::geometry::{Point, Pose};
+use crate::geometry::Pose;
 use crate::graph::ScanGraph;
 use crate::optimize::{Correspondence, Correspondences};
-use crate::pairwise::{Counts, PairKey, look, perturbed_about, quick_overlap};
+use crate::pairwise::{Contacts, Counts, Motion, PairKey, look, perturbed_about, quick_overlap};
 
 /// Cosine by which normals of corresponding points agree at least.
 const MIN_NORMAL_DOT: f32 = 0.5;
@@ -44,26 +44,23 @@ pub fn associate(
     stride: usize,
     offset: usize,
 ) -> Vec<Correspondence> {
-    let rotation = i_from_j.rotation.matrix().cast::<f32>();
-    let translation = i_from_j.translation.cast::<f32>();
-    let gate = gate as f32;
+    let motion = Motion::of(i_from_j);
+    let square_gate = (gate as f32).powi(2);
     let mut found = Vec::with_capacity(j.prepared.points.len() / stride);
-    for (point, normal) in j.prepared.points.iter().zip(&j.prepared.normals).skip(offset).step_by(stride) {
-        let q = rotation * Vector3::from(*point) + translation;
-        let moved: Point = [q.x, q.y, q.z];
-        let Some(near) = i.grid.nearest(&moved) else { continue };
-        let surface_normal = i.prepared.normals[near];
-        let offset = q - Vector3::from(i.prepared.points[near]);
-        if offset.norm_squared() < gate * gate
-            && Vector3::from(surface_normal).dot(&(rotation * Vector3::from(*normal))) > MIN_NORMAL_DOT
-        {
-            found.push(Correspondence {
-                point_in_i: i.prepared.points[near],
-                normal_in_i: surface_normal,
-                point_in_j: *point,
-                weight: 1.0,
-            });
+    let (mut block, mut first) = (Contacts::new(), offset);
+    while let Some(next) = block.fill(i, j, &motion, first, stride) {
+        for k in 0..block.len {
+            if block.square[k] < square_gate && block.agreement(k) > MIN_NORMAL_DOT {
+                let near = block.near(k);
+                found.push(Correspondence {
+                    point_in_i: i.prepared.points[near],
+                    normal_in_i: i.prepared.normals[near],
+                    point_in_j: j.prepared.points[first + k * stride],
+                    weight: 1.0,
+                });
+            }
         }
+        first = next;
     }
     found
 }

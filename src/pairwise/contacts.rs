@@ -9,16 +9,16 @@ use crate::features::Scan;
 use crate::geometry::{Point, Pose};
 
 /// Points of a block. Its arrays stay in the first-level cache.
-pub(super) const BLOCK: usize = 256;
+pub(crate) const BLOCK: usize = 256;
 
 /// The arithmetic goes over this many points at once; `len` is filled up to a multiple of it.
 pub(super) const LANES: usize = 16;
 
 /// One number a point of the block.
-pub(super) type Numbers = [f32; BLOCK];
+pub(crate) type Numbers = [f32; BLOCK];
 
 /// A motion in single precision: rotation by rows, and translation in metres.
-pub(super) struct Motion {
+pub(crate) struct Motion {
     rotation: [[f32; 3]; 3],
     translation: [f32; 3],
 }
@@ -36,7 +36,7 @@ impl Motion {
 
 /// A block of points of one scan, carried into the frame of another. Beyond `len` the arrays hold nothing of meaning, except that
 /// `square` is infinite there up to the next multiple of [`LANES`].
-pub(super) struct Contacts {
+pub(crate) struct Contacts {
     /// Points of the block in use.
     pub len: usize,
     /// The carried points, metres.
@@ -65,6 +65,16 @@ impl Contacts {
             square: [f32::INFINITY; BLOCK],
             found: [0; BLOCK],
         }
+    }
+
+    /// Which point of the scan a point of the block meets; of meaning only where `square` is finite.
+    pub fn near(&self, at: usize) -> usize {
+        self.found[at] as usize
+    }
+
+    /// Cosine between the turned normal of a point and that of the point it meets.
+    pub fn agreement(&self, at: usize) -> f32 {
+        (0..3).map(|k| self.surface[k][at] * self.normal[k][at]).sum()
     }
 
     /// `len`, filled up to a multiple of [`LANES`].

@@ -13,6 +13,7 @@ mod shortlist;
 mod verifier;
 
 pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, agreement, centred_difference, consensus};
+pub(crate) use contacts::{Contacts, Motion};
 pub use dense::{Counts, look, quick_overlap};
 pub use icp::{icp, perturbed_about};
 pub use matching::{Match, mutual_matches};
