@@ -166,12 +166,14 @@ const LEAST_MEMORY: u64 = 256 << 20;
 /// What decoding and preparing a scan takes at its peak, bytes for a point (measured, see docs/operations.md).
 const BYTES_PER_POINT: u64 = 120;
 
-/// Memory of this machine, bytes; 8 GiB where it is not told.
+/// Memory of this machine, or of the container if that is less, bytes; 8 GiB where it is not told.
 fn machine_memory() -> u64 {
+    let container = std::fs::read_to_string("/sys/fs/cgroup/memory.max").ok();
+    let container = container.and_then(|text| text.trim().parse().ok()).unwrap_or(u64::MAX);
     let info = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let line = info.lines().find_map(|line| line.strip_prefix("MemTotal:"));
     let kib: Option<u64> = line.and_then(|line| line.trim().trim_end_matches(" kB").parse().ok());
-    kib.map_or(8 << 30, |kib| kib * 1024)
+    kib.map_or(8 << 30, |kib| kib.saturating_mul(1024)).min(container)
 }
 
 /// What each of so many workers may use of this machine's memory, bytes: three quarters of it between them.

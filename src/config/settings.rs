@@ -22,7 +22,7 @@ pub struct Settings {
     /// Jobs at once [default: 2]
     #[arg(long, env = "CAIRN_WORKERS", value_name = "N")]
     pub workers: Option<usize>,
-    /// Threads that compute [default: one for each core]
+    /// Threads that compute, in the service and in each process of jobs [default: one for each core]
     #[arg(long, env = "CAIRN_THREADS", value_name = "N")]
     pub threads: Option<usize>,
     /// Largest upload, bytes [default: 17179869184, which is 16 GiB]

@@ -3,13 +3,16 @@
 use super::candidates::{Candidate, support_of};
 use super::component::Component;
 use super::consistency::thrown;
-use super::join::{BENT_LENIENCE, SINGLE_STARTS, ViolationLimit, pooled_fit, violation_of};
+use super::join::{SINGLE_STARTS, ViolationLimit, pooled_fit, violation_of};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{Reach, dense, pose_graph};
 use super::surfaces::judge;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
 use crate::graph::ScanGraph;
+
+/// What was bent may violate free space this many times as much as a straight join. Wrong joins do so more than twice as much.
+const LENIENCE: f64 = 1.3;
 
 /// A join of two components that are each a little bent, so that no rigid motion fits all that they share: they are joined on
 /// trial, adjusted together, and judged as they then stand. `None` when that does not help, or when another pose is nearly as well supported.
@@ -43,7 +46,7 @@ pub fn bent_join(
     let limit = ViolationLimit::new(graph, (a, b), candidate.support, level, options);
     let banned = options.decisions.forbids(graph, &x, &y, &Pose::identity(), options);
     let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
-    Ok((!banned && found <= BENT_LENIENCE * limit.share() && kept >= level.support).then_some(joined))
+    Ok((!banned && found <= LENIENCE * limit.share() && kept >= level.support).then_some(joined))
 }
 
 /// Of the fit to all edges and the poses of single edges, the one that is most clear of free space. The fit lies where the adjustment

@@ -18,9 +18,6 @@ use crate::pairwise::{Counts, inlier_matches};
 const FIT_ITERATIONS: usize = 5;
 /// Firm support allows this many times the usual violation, at most.
 const FIRM_LENIENCE: f64 = 1.5;
-/// What was bent, and what has grown since it was joined, may violate free space this many times as much as a straight new join. Wrong
-/// joins do so more than twice as much.
-pub const BENT_LENIENCE: f64 = 1.5;
 /// Of the points that are near the other side, at most this share may face another way. Right joins of components show up to 0.3.
 const MAX_WRONG_NORMAL: f64 = 0.38;
 /// Edges whose own poses are tried where the fit to all of them fails.
@@ -71,7 +68,8 @@ struct Placed {
 
 /// The violation that a join may show: little more than the two sides show within themselves, so that clean data, where wrong joins of
 /// alike rooms stand out, is judged more strictly than noisy data; more where support is firm, since a fit that is a little off
-/// violates a little; and never more than the level says. What the sides show is only counted when that matters.
+/// violates a little; and never more than the level says. What was bent, or has grown since, is allowed some times as much by those who
+/// ask. What the sides show is only counted when that matters.
 pub struct ViolationLimit<'m> {
     /// Always allowed.
     least: f64,

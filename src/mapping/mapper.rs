@@ -5,15 +5,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::bent_join::bent_join;
 use super::candidates::{CLUSTERS, Candidate, candidates};
 use super::component::Component;
-use super::consistency::{supports, thrown, weakest_cut};
+use super::consistency::{supports, weakest_cut};
+use super::guarded::{guarded, refined};
 use super::initial_pair::initial_pairs;
 use super::join::{Refusal, weigh_join};
 use super::next_scan::visible_landmarks;
 use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
-use super::refine::{Reach, dense, local_bundle_adjustment, neighborhood, pose_graph};
+use super::refine::{Reach, dense, local_bundle_adjustment, neighborhood};
 use super::snapshot::WaitingReason;
-use super::surfaces::judge_inside;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::{Retrieval, ScanGraph};
@@ -414,50 +414,6 @@ impl Mapper {
             self.add_waiting(scan);
         }
     }
-}
-
-/// A component after the pose graph and the joint dense adjustment, or after the dense adjustment alone where that leaves less in free
-/// space: edges of little overlap all slide the same way, and a pose graph of such edges bends what was straight.
-fn refined(
-    graph: &ScanGraph,
-    component: &Component,
-    voxel: f64,
-    options: &MappingOptions,
-    control: Control<'_>,
-) -> Result<Component, Cancelled> {
-    let violation = |component: &Component| judge_inside(graph, component).violation_share();
-    let on_surfaces = |mut component: Component| {
-        guarded(graph, &mut component, options, |component| {
-            dense(graph, component, None, Reach::NEAR, voxel, control).map(drop)
-        })?;
-        Ok(component)
-    };
-    let mut spread = component.clone();
-    guarded(graph, &mut spread, options, |component| {
-        pose_graph(graph, component, Reach::NEAR, voxel, options, control)
-    })?;
-    let spread = on_surfaces(spread)?;
-    let bent = violation(&spread);
-    if bent <= violation(component) {
-        return Ok(spread);
-    }
-    let alone = on_surfaces(component.clone())?;
-    Ok(if violation(&alone) < bent { alone } else { spread })
-}
-
-/// Runs an adjustment and takes it back if it throws a scan off its edges.
-fn guarded(
-    graph: &ScanGraph,
-    component: &mut Component,
-    options: &MappingOptions,
-    adjust: impl FnOnce(&mut Component) -> Result<(), Cancelled>,
-) -> Result<(), Cancelled> {
-    let mut adjusted = component.clone();
-    adjust(&mut adjusted)?;
-    if thrown(graph, component, &adjusted, options).is_empty() {
-        *component = adjusted;
-    }
-    Ok(())
 }
 
 /// The refusal that says more: a violation or a rival over mere lack of support, and more support over less.

@@ -12,6 +12,7 @@ mod component;
 mod consistency;
 mod decision;
 mod filter;
+mod guarded;
 mod initial_pair;
 mod intrusion;
 mod join;

@@ -4,7 +4,7 @@
 //! a component from an initial pair. Any success goes back to the strictest level, because the model has grown and what waited may
 //! now be well supported. When nothing fits, misplaced scans are filtered and tried again, and retrieval widens for what stays apart.
 //! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. Where
-//! alike places were found, none but firm ones are made at all. What is left then waits.
+//! alike places were found, none but firm ones are made from then on. What is left waits.
 
 use std::collections::BTreeSet;
 
@@ -29,9 +29,11 @@ pub fn grow(
     let mut rounds = 0;
     let mut undone = 0;
     let mut options = options.clone();
-    let mut levels = options.firm_levels().to_vec();
+    let mut weakly = false;
     loop {
-        join_all(mapper, graph, &levels, voxel, &options, control)?;
+        let all = weakly && mapper.doubted.is_empty();
+        let levels = if all { &options.levels } else { options.firm_levels() };
+        join_all(mapper, graph, levels, voxel, &options, control)?;
         if mapper.filter_scans(graph, voxel, &options) > 0 {
             continue;
         }
@@ -50,8 +52,8 @@ pub fn grow(
         if !fresh.is_empty() {
             rounds += 1;
             pairs.extend(graph.try_pairs(&fresh, &options.support, control)?);
-        } else if levels.len() < options.levels.len() && mapper.doubted.is_empty() {
-            levels.clone_from(&options.levels);
+        } else if !weakly {
+            weakly = true;
         } else {
             break;
         }

@@ -1,6 +1,7 @@
 //! Taking back what later evidence contradicts. Where the pairs that speak against a component all speak against one join in it, or its
-//! sides turn out to stand in each other's free space, that join is undone and its pose is not tried again; where they are too many for that, alike places were folded onto each other: nothing
-//! there can be told from its twin, so nothing is kept, and the scans wait until a new scan or a decision changes what is known.
+//! sides turn out to stand in each other's free space, that join is undone and its pose is not tried again; where they are too many for
+//! that, alike places were folded onto each other: nothing there can be told from its twin, so nothing is kept, and the scans wait
+//! until a new scan or a decision changes what is known.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -15,7 +15,6 @@
 mod corpus;
 mod engine;
 mod machine;
-
 mod mutate;
 mod targets;
 

@@ -65,8 +65,10 @@ impl Proxies {
         if !self.trust(peer) {
             return peer;
         }
-        let lists = headers.get_all("x-forwarded-for").iter().filter_map(|value| value.to_str().ok());
-        let heard: Vec<&str> = lists.flat_map(|list| list.split(',')).map(str::trim).collect();
+        // What is no text ends the search as any other made-up name does.
+        let lists = headers.get_all("x-forwarded-for").iter();
+        let lists: Vec<_> = lists.map(|value| String::from_utf8_lossy(value.as_bytes())).collect();
+        let heard: Vec<&str> = lists.iter().flat_map(|list| list.split(',')).map(str::trim).collect();
         let mut sender = peer;
         for text in heard.into_iter().rev() {
             let Some(address) = address(text) else { break };
@@ -107,6 +109,16 @@ mod tests {
         assert_eq!(sender("::ffff:10.0.0.1", &["198.51.100.7"]), "198.51.100.7");
         assert_eq!(sender("10.0.0.1", &["198.51.100.7, unknown"]), "10.0.0.1");
         assert_eq!(sender("10.0.0.1", &[]), "10.0.0.1");
+    }
+
+    #[test]
+    fn a_list_that_is_no_text_hides_what_stands_before_it() {
+        let proxies = Proxies(vec!["10.0.0.0/8".parse().unwrap()]);
+        let mut headers = HeaderMap::new();
+        headers.append("x-forwarded-for", "203.0.113.9".parse().unwrap());
+        headers.append("x-forwarded-for", axum::http::HeaderValue::from_bytes(b"\xe9").unwrap());
+        let peer: IpAddr = "10.0.0.1".parse().unwrap();
+        assert_eq!(proxies.sender(peer, &headers), peer);
     }
 
     #[test]

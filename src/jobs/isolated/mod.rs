@@ -99,7 +99,7 @@ impl Performer {
     /// Has the job done by a process of its own, and sees to it that it ends.
     pub async fn perform_isolated(&self, isolated: &Isolated, lane: Lane, claim: Claim) {
         let (lease, project) = (claim.lease.clone(), claim.job.project);
-        let _at_work = self.processes.begin(&self.options);
+        let _at_work = self.processes.begin(lane, project, &self.options);
         let (mut process, limit) = match self.begin(isolated, lane, &claim).await {
             Ok(begun) => begun,
             Err(error) => {
@@ -178,16 +178,15 @@ impl Performer {
         let mut tick = tokio::time::interval(self.options.progress_every);
         let (begun, mut seen) = (Instant::now(), claim.job.revision);
         loop {
-            let ours = tokio::select! {
-                _ = tick.tick() => false,
+            tokio::select! {
+                _ = tick.tick() => {}
                 change = changes.recv() => {
                     if change.is_ok_and(|id| claim.lease.all().all(|own| own != id)) {
                         continue;
                     }
-                    true
                 }
                 () = self.stop.cancelled() => return Interruption::Stopping,
-            };
+            }
             if begun.elapsed() > limit {
                 return Interruption::Overdue;
             }
@@ -196,10 +195,9 @@ impl Performer {
             }
             match self.store.holds(&claim.lease).await {
                 Ok(Some(revision)) if revision != seen => {
+                    // What is told here comes back as a change, and is known then.
                     seen = revision;
-                    if !ours {
-                        self.store.relay(claim.lease.all());
-                    }
+                    self.store.relay(claim.lease.all());
                 }
                 Ok(Some(_)) => {}
                 // Ended by the process itself, which is about to say so, or taken away.

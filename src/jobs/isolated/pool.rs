@@ -32,12 +32,16 @@ impl Processes {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Tells that a process begins to work. When as many work as may, those that wait give their memory to them.
-    pub(super) fn begin(&self, options: &WorkerOptions) -> AtWork<'_> {
+    /// Tells that a process begins to work on a job of this lane and project. When as many work as may, those that wait give their memory
+    /// to them, except what may serve this very job.
+    pub(super) fn begin(&self, lane: Lane, project: ProjectId, options: &WorkerOptions) -> AtWork<'_> {
         let mut state = self.state();
         state.at_work += 1;
         if state.at_work >= options.workers {
-            state.idle.retain(|process| process.memory() <= options.memory_bytes / 4);
+            state.idle.retain(|process| {
+                let serves = process.lane == lane && process.worked_on.contains(&project);
+                serves || process.memory() <= options.memory_bytes / 4
+            });
         }
         AtWork(self)
     }
