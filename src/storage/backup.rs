@@ -2,7 +2,7 @@
 //!
 //! The database is copied by SQLite itself, which gives one moment of it (`VACUUM INTO`). The files that it names never change, and
 //! none is deleted meanwhile ([`Hold`](super::Hold)), so they are linked where that can be, and copied otherwise. Every one is read
-//! and compared with its hash. The database gets its name last: a copy that was interrupted is not taken for one.
+//! and compared with its hash. Uploads that are not complete are left out. The database gets its name last: a copy that was interrupted is not taken for one.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -78,10 +78,13 @@ async fn finish(
     partial: PathBuf,
     sharing: Sharing,
 ) -> Result<Copied, StorageError> {
-    let options = SqliteConnectOptions::new().filename(&partial).read_only(true);
+    let options = SqliteConnectOptions::new().filename(&partial);
     let database: SqlitePool = SqlitePoolOptions::new().max_connections(1).connect_with(options).await?;
+    // The bytes of uploads that are not complete stay behind, for they change: who goes on with one is told that it is not there.
+    let forgotten = sqlx::query("DELETE FROM uploads WHERE scan_id IS NULL").execute(&database).await;
     let all = references(&database).await;
     database.close().await;
+    forgotten?;
     let (all, to) = (all?, to.to_owned());
     tokio::task::spawn_blocking(move || {
         let copied = copy_blobs(&source, &to.join("blobs"), all, sharing)?;
@@ -177,9 +180,9 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::project::ProjectId;
-    use crate::storage::Page;
+    use crate::project::{Interpretation, Name, NewUpload, ProjectId, Timestamp};
     use crate::storage::testing::{new_scan, project};
+    use crate::storage::{Page, Seal};
 
     const ALL: Page = Page { after: None, limit: 100 };
 
@@ -218,6 +221,39 @@ mod tests {
         assert_eq!(scans.len(), 1);
         assert_eq!(restored.blobs.get(BlobId::parse(&scans[0].blob).unwrap()).unwrap(), b"first");
         assert!(restored.integrity().await.unwrap().is_empty());
+    }
+
+    #[tokio::test]
+    async fn uploads_that_are_not_complete_stay_behind_and_short_ones_are_told_by_a_check() {
+        let dir = tempfile::tempdir().unwrap();
+        let [data, copy, again] = ["data", "copy", "again"].map(|name| dir.path().join(name));
+        let (store, project) = filled(&data).await;
+        let new = NewUpload {
+            project,
+            name: Name::parse("scan").unwrap(),
+            interpretation: Interpretation::default(),
+            metadata: String::new(),
+            length: 10,
+            sender: None,
+        };
+        let expires = Timestamp::now().plus(Duration::from_mins(1));
+        let upload = store.create_upload(new, expires, Seal::none()).await.unwrap();
+        let mut file = store.uploads.at(upload.id, 0).await.unwrap();
+        file.write(b"seven b").await.unwrap();
+        file.sync().await.unwrap();
+        store.advance_upload(upload.id, 7, expires).await.unwrap();
+        assert_eq!(store.integrity().await.unwrap(), [""; 0]);
+
+        backup(&data, &copy, Sharing::Links).await.unwrap();
+        restore(&copy, &again, Sharing::Copies).await.unwrap();
+        let restored = Store::open(&again).await.unwrap();
+        assert!(matches!(restored.upload(upload.id).await, Err(StorageError::NoUpload(_))));
+        assert_eq!(restored.integrity().await.unwrap(), [""; 0]);
+
+        file.cut(4).await.unwrap();
+        let told = store.integrity().await.unwrap();
+        let expected = format!("an upload has 4 of the 7 bytes that were acknowledged: {}", upload.id);
+        assert_eq!(told, [expected]);
     }
 
     #[tokio::test]

@@ -222,8 +222,13 @@ impl Store {
         if whole { Ok(Some(count(&row, "revision")?)) } else { Ok(None) }
     }
 
-    /// Tells listeners of jobs that another process has changed, and wakes idle workers.
+    /// Tells listeners of jobs that another process has changed and still holds: there is nothing new to claim.
     pub fn relay(&self, jobs: impl IntoIterator<Item = JobId>) {
+        self.announce(jobs);
+    }
+
+    /// Tells listeners of jobs that another process has let go of, ended or moved on, and wakes idle workers.
+    pub fn relay_freed(&self, jobs: impl IntoIterator<Item = JobId>) {
         self.announce(jobs);
         self.ring();
     }

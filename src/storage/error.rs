@@ -149,6 +149,11 @@ const SQLITE_LOCKED: i32 = 6;
 const SQLITE_IOERR: i32 = 10;
 const SQLITE_FULL: i32 = 13;
 const SQLITE_CANTOPEN: i32 = 14;
+/// What is written to may have become read-only, as file systems do when their disk fails.
+const SQLITE_READONLY: i32 = 8;
+/// So many opened the database at once that one of them gave up.
+const SQLITE_PROTOCOL: i32 = 15;
+
 fn words(holder: Holder) -> &'static str {
     match holder {
         Holder::Project(_) => "the project",
@@ -182,13 +187,16 @@ impl StorageError {
             }),
             Self::Database(sqlx::Error::PoolTimedOut) => Some(Trouble::Busy),
             // A commit failed under the connection, and so did the one that took its place: the disk goes on failing.
-            Self::Database(sqlx::Error::InvalidSavePointStatement) => Some(Trouble::Failing),
+            // Or the connection could not be made, or ended under a statement.
+            Self::Database(
+                sqlx::Error::InvalidSavePointStatement | sqlx::Error::Io(_) | sqlx::Error::WorkerCrashed,
+            ) => Some(Trouble::Failing),
             Self::Database(sqlx::Error::Database(error)) => {
                 let code: i32 = error.code()?.parse().ok()?;
                 match code & 0xff {
                     SQLITE_FULL => Some(Trouble::Full),
-                    SQLITE_BUSY | SQLITE_LOCKED => Some(Trouble::Busy),
-                    SQLITE_IOERR | SQLITE_CANTOPEN => Some(Trouble::Failing),
+                    SQLITE_BUSY | SQLITE_LOCKED | SQLITE_PROTOCOL => Some(Trouble::Busy),
+                    SQLITE_IOERR | SQLITE_CANTOPEN | SQLITE_READONLY => Some(Trouble::Failing),
                     _ => None,
                 }
             }

@@ -1,8 +1,10 @@
-//! Whether the database is sound, and whether its rows make sense together.
+//! Whether the database is sound, and whether its rows make sense together and with the uploads that are under way.
 
 use sqlx::Row;
 
+use super::rows::{count, parsed};
 use super::{StorageError, Store};
+use crate::project::{Timestamp, UploadId};
 
 /// What must never be: what it means, and a query for the rows where it is so.
 const NEVER: &[(&str, &str)] = &[
@@ -34,6 +36,15 @@ const NEVER: &[(&str, &str)] = &[
         "SELECT id FROM jobs WHERE worker IS NOT NULL AND state NOT IN ('accepted', 'running')",
     ),
     (
+        "what a project or a key holds is miscounted",
+        "SELECT COALESCE(h.holder, s.holder) FROM (SELECT * FROM holdings WHERE scans > 0 OR bytes > 0) h
+           FULL JOIN (SELECT holder, COUNT(*) AS scans, SUM(bytes) AS bytes FROM
+             (SELECT project_id AS holder, bytes FROM scans WHERE deleted_ms IS NULL
+              UNION ALL SELECT key_id, bytes FROM scans WHERE deleted_ms IS NULL AND key_id IS NOT NULL) GROUP BY holder) s
+             ON s.holder = h.holder
+           WHERE s.scans IS NOT h.scans OR s.bytes IS NOT h.bytes",
+    ),
+    (
         "a registered scan has no place",
         "SELECT id FROM scans WHERE state = 'registered' AND standing IS NULL",
     ),
@@ -59,6 +70,39 @@ impl Store {
                 wrong.push(format!("{what}: {subject}"));
             }
         }
+        for (id, safe, found) in self.torn_uploads().await? {
+            wrong.push(format!("an upload has {found} of the {safe} bytes that were acknowledged: {id}"));
+        }
         Ok(wrong)
+    }
+
+    /// Uploads that can be continued and whose files are shorter than clients were told: how many bytes should be there, and are.
+    async fn torn_uploads(&self) -> Result<Vec<(UploadId, u64, u64)>, StorageError> {
+        let mut torn = self.begun_uploads(None).await?;
+        torn.retain(|(id, safe)| self.uploads.found(*id) < *safe);
+        let mut still = Vec::new();
+        for (id, _) in torn {
+            // A service that runs may have ended it, or thrown it away, between the look at its row and that at its file.
+            let again = self.begun_uploads(Some(id)).await?.into_iter();
+            still.extend(
+                again
+                    .map(|(id, safe)| (id, safe, self.uploads.found(id)))
+                    .filter(|(_, safe, found)| found < safe),
+            );
+        }
+        Ok(still)
+    }
+
+    /// Uploads, or this one, whose bytes are in a file of their own, each with how many of them are safe.
+    async fn begun_uploads(&self, one: Option<UploadId>) -> Result<Vec<(UploadId, u64)>, StorageError> {
+        let rows = sqlx::query(
+            "SELECT id, received FROM uploads WHERE scan_id IS NULL AND blob IS NULL AND received > 0 AND expires_ms > ?1
+               AND (?2 IS NULL OR id = ?2) ORDER BY id",
+        )
+        .bind(Timestamp::now().0)
+        .bind(one.map(|id| id.to_string()))
+        .fetch_all(&self.read)
+        .await?;
+        rows.iter().map(|row| Ok((parsed(row, "id")?, count(row, "received")?))).collect()
     }
 }

@@ -8,7 +8,7 @@ use super::{Page, Seal, StorageError, Store};
 use crate::control::Seed;
 use crate::project::{KeyId, Name, Project, ProjectId, ProjectSettings, Timestamp, VersionNumber};
 
-const SELECT: &str = "SELECT p.rowid AS position, p.*, (SELECT COUNT(*) FROM scans s WHERE s.project_id = p.id AND s.deleted_ms IS NULL) AS scans FROM projects p ";
+const SELECT: &str = "SELECT p.rowid AS position, p.*, COALESCE((SELECT scans FROM holdings WHERE holder = p.id), 0) AS scans FROM projects p ";
 
 impl Store {
     /// Makes a project, and keeps the answer to the request for it.

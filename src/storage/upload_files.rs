@@ -80,6 +80,11 @@ impl UploadFiles {
         }
     }
 
+    /// How many bytes of an upload are here; 0 if its file cannot be seen.
+    pub(super) fn found(&self, id: UploadId) -> u64 {
+        fs::metadata(self.path(id)).map_or(0, |file| file.len())
+    }
+
     /// All uploads that have bytes here. Blocks.
     pub(super) fn ids(&self) -> Result<Vec<UploadId>, StorageError> {
         let mut ids = Vec::new();
