@@ -13,6 +13,22 @@ function showKeyForm(needed) {
   $("layout").hidden = needed;
 }
 
+/** What a refusal or failure says: what it is, why, and when to try again where it says that. */
+class Refusal extends Error {
+  constructor(response, problem) {
+    const seconds = Number.parseInt(response.headers.get("retry-after"), 10);
+    const what = problem?.title || response.statusText || `status ${response.status}`;
+    const why = problem?.detail ? `: ${problem.detail}` : "";
+    super(`${what}${why}${seconds > 0 ? ` (try again in ${inWords(seconds)})` : ""}`);
+    this.retryMs = seconds > 0 ? seconds * 1000 : 0;
+  }
+}
+
+function inWords(seconds) {
+  if (seconds < 100) return `${seconds} s`;
+  return seconds < 6000 ? `${Math.ceil(seconds / 60)} min` : `${Math.ceil(seconds / 3600)} h`;
+}
+
 /** An answer of the API, or an error that says what its problem says. */
 async function request(path, options) {
   const headers = new Headers(options?.headers);
@@ -21,7 +37,7 @@ async function request(path, options) {
   showKeyForm(response.status === 401);
   if (response.ok) return response;
   const problem = await response.json().catch(() => null);
-  throw new Error(problem?.detail ?? response.statusText);
+  throw new Refusal(response, problem);
 }
 
 async function api(path, options) {
@@ -220,7 +236,8 @@ async function upload(files) {
   const own = `/v1/projects/${chosen()}/scans`;
   for (const file of files) {
     $("notice").textContent = `uploading ${file.name}`;
-    await api(`${own}?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
+    const sent = api(`${own}?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
+    await sent.catch((error) => { throw new Error(`${file.name} was not taken. ${error.message}`); });
   }
 }
 
@@ -251,7 +268,8 @@ for (const asked of document.querySelectorAll("[data-kind]")) {
 addEventListener("hashchange", () => refresh().catch(() => {}));
 
 for (;;) {
-  // The service may be restarting; the next look will tell.
-  if ($("key-form").hidden) await refresh().catch(() => {});
-  await sleep(document.hidden ? 10_000 : 1_500);
+  // What is wrong goes away when a look succeeds: the service may be restarting, or have too much to do.
+  const wrong = $("key-form").hidden ? await refresh().then(() => null, (error) => error) : null;
+  $("trouble").textContent = wrong?.message ?? "";
+  await sleep(Math.max(document.hidden ? 10_000 : 1_500, wrong?.retryMs ?? 0));
 }

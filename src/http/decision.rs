@@ -13,7 +13,7 @@ use super::idempotency::{Once, Reply};
 use super::job::JobBody;
 use super::link::Link;
 use super::problem::{Problem, Problems};
-use super::query::{Params, cursor};
+use super::query::{Params, next};
 use super::router::Api;
 use crate::geometry::Pose;
 use crate::project::{
@@ -154,7 +154,7 @@ pub(super) async fn list_decisions(
     query.finish()?;
     api.store.project(project).await?;
     let found = api.store.decisions(project, page).await?;
-    let next = found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at));
+    let next = next(page, &found);
     let items = found.iter().map(|(_, kept)| DecisionBody::new(project, kept)).collect();
     Ok(Json(DecisionList { items, next }))
 }

@@ -16,7 +16,7 @@ use super::extract::{Body, Ids};
 use super::idempotency::{Once, Reply};
 use super::link::Link;
 use super::problem::{Problem, Problems};
-use super::query::{Params, cursor};
+use super::query::{Params, next};
 use super::router::Api;
 use crate::project::{Job, JobId, JobKind, JobState, ProjectId, ScanId, Timestamp};
 use crate::storage::{JobFilter, Store};
@@ -166,7 +166,7 @@ pub(super) async fn list_jobs(
     query.finish()?;
     api.store.project(project).await?;
     let found = api.store.jobs(project, filter, page).await?;
-    let next = found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at));
+    let next = next(page, &found);
     Ok(Json(JobList { items: found.into_iter().map(|(_, j)| j.into()).collect(), next }))
 }
 

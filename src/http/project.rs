@@ -11,7 +11,7 @@ use super::extract::{Body, Ids};
 use super::idempotency::{Once, Reply};
 use super::link::Link;
 use super::problem::{Problem, Problems};
-use super::query::{Params, cursor};
+use super::query::{Params, next};
 use super::router::Api;
 use crate::control::Seed;
 use crate::project::{Name, Project, ProjectId, ProjectSettings, Timestamp, VersionNumber};
@@ -129,7 +129,7 @@ pub(super) async fn list_projects(
     let page = query.page()?;
     query.finish()?;
     let found = api.store.projects(page, caller.granted()).await?;
-    let next = found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at));
+    let next = next(page, &found);
     Ok(Json(ProjectList { items: found.into_iter().map(|(_, p)| p.into()).collect(), next }))
 }
 

@@ -103,6 +103,11 @@ impl Params {
     }
 }
 
+/// The position of the next part of a list, if what was found of it, each with its position, fills the page.
+pub(super) fn next<T>(page: Page, found: &[(i64, T)]) -> Option<String> {
+    found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at))
+}
+
 /// A list's opaque position.
 pub(super) fn cursor(position: i64) -> String {
     format!("{position:x}")

@@ -10,7 +10,7 @@ use super::extract::{Body, Ids};
 use super::idempotency::{Once, Reply};
 use super::link::Link;
 use super::problem::{Problem, Problems};
-use super::query::{Params, cursor};
+use super::query::{Params, next};
 use super::router::Api;
 use crate::jobs::webhooks::{new_secret, reveal};
 use crate::project::{Delivery, JobId, ProjectId, Timestamp, Webhook, WebhookId};
@@ -187,7 +187,7 @@ pub(super) async fn list_deliveries(
     query.finish()?;
     api.store.webhook(project, webhook).await?;
     let found = api.store.deliveries(webhook, page).await?;
-    let next = found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at));
+    let next = next(page, &found);
     Ok(Json(DeliveryList { items: found.into_iter().map(|(_, d)| d.into()).collect(), next }))
 }
 

@@ -74,10 +74,28 @@ pub struct Exports {
     store: Store,
     compute: Compute,
     max_points: u64,
-    free_bytes: u64,
+    disk: Disk,
     /// One at a time: a merged cloud may take gigabytes of disk and all threads.
     building: Arc<Mutex<()>>,
 }
+
+/// The disk that exports are written to.
+#[derive(Debug, Clone)]
+struct Disk {
+    store: Store,
+    /// Bytes that stay free.
+    free_bytes: u64,
+}
+
+impl Disk {
+    /// Fails if nothing more may be written now.
+    fn check(&self) -> Result<(), ExportError> {
+        if self.store.free_bytes()? < self.free_bytes { Err(ExportError::LowDisk) } else { Ok(()) }
+    }
+}
+
+/// Points that are written between two looks at how much disk is free: about 32 MB, a small part of what should stay free.
+const LOOK_EVERY: u64 = 2_000_000;
 
 /// Names the form of the exported files; another one makes old ones unreachable.
 const FORM: &str = "export/1";
@@ -87,7 +105,8 @@ impl Exports {
     /// `free_bytes` of disk are free.
     #[must_use]
     pub fn new(store: Store, compute: Compute, max_points: u64, free_bytes: u64) -> Self {
-        Self { store, compute, max_points, free_bytes, building: Arc::default() }
+        let disk = Disk { store: store.clone(), free_bytes };
+        Self { store, compute, max_points, disk, building: Arc::default() }
     }
 
     /// The merged cloud of a version as binary PLY, in metres, in the frame of its component.
@@ -101,7 +120,9 @@ impl Exports {
         let key = key(&format!("cloud {:?}", request.voxel), &placed);
         let blobs = self.store.blobs.clone();
         let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
-        self.made(project, key, move || blobs.put_with(|file| write_ply(file, &merge, request.voxel))).await
+        let disk = self.disk.clone();
+        self.made(project, key, move || blobs.put_with(|file| write_ply(file, &merge, request.voxel, &disk)))
+            .await
     }
 
     /// A picture of a version: PNG, the component from above and from the side.
@@ -133,9 +154,7 @@ impl Exports {
         if let Some(found) = self.remembered(&key).await? {
             return Ok(found);
         }
-        if self.store.free_bytes()? < self.free_bytes {
-            return Err(ExportError::LowDisk);
-        }
+        self.disk.check()?;
         let (compute, store) = (self.compute.clone(), self.store.clone());
         // A computation does not stop when its client leaves, so the turn stays with it: clients that come and go would have any
         // number of them run at once.
@@ -200,7 +219,7 @@ fn key(parameters: &str, placed: &[(Scan, Placement)]) -> blake3::Hash {
     hasher.finalize()
 }
 
-fn write_ply(file: &mut File, merge: &Merge, voxel: Option<f64>) -> Result<(), ExportError> {
+fn write_ply(file: &mut File, merge: &Merge, voxel: Option<f64>, disk: &Disk) -> Result<(), ExportError> {
     let offset = merge.offset();
     let mut comments = vec!["made by cairn; metres".to_owned()];
     if offset != [0.0; 3] {
@@ -210,16 +229,62 @@ fn write_ply(file: &mut File, merge: &Merge, voxel: Option<f64>) -> Result<(), E
     let comments: Vec<&str> = comments.iter().map(String::as_str).collect();
     let out = BufWriter::with_capacity(1 << 20, file);
     let mut ply = PlyWriter::new(out, merge.colored(), &comments)?;
+    let mut written = 0_u64;
+    let mut write = |point, color| -> Result<(), ExportError> {
+        // Whoever else writes, such as an upload, may have used up what was free when this began.
+        if written.is_multiple_of(LOOK_EVERY) {
+            disk.check()?;
+        }
+        written += 1;
+        Ok(ply.colored_point(point, color)?)
+    };
     match voxel {
         None => merge.visit(&offset, |_, point, color| {
-            Ok(ply.colored_point([point.x as f32, point.y as f32, point.z as f32], color)?)
+            write([point.x as f32, point.y as f32, point.z as f32], color)
         })?,
         Some(edge) => {
             for (point, color) in merge.thinned(&offset, edge)? {
-                ply.colored_point(point, color)?;
+                write(point, color)?;
             }
         }
     }
     ply.finish()?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose;
+    use crate::storage::testing::{Fixture, new_scan};
+
+    #[tokio::test]
+    async fn an_export_ends_and_leaves_nothing_when_the_disk_runs_low_while_it_is_written() {
+        let at = Fixture::new().await;
+        let points = "1 2 3\n".repeat(4);
+        let file = format!(
+            "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n{points}"
+        );
+        let scan = new_scan(at.project, 1, *at.blob(&file));
+        let scan = at.store.admit_scan(&scan).await.unwrap().scan;
+        let place = Placement {
+            component: 0,
+            model_from_scan: Pose::identity(),
+            landmarks: 0,
+            neighbours: 0,
+            landmark_rms: 0.0,
+        };
+        let merge = Merge { blobs: at.store.blobs.clone(), placed: vec![(scan, place)], max_points: 9 };
+        let export = |free_bytes, voxel| {
+            let disk = Disk { store: at.store.clone(), free_bytes };
+            at.store.blobs.put_with(|file| write_ply(file, &merge, voxel, &disk)).map(|blob| blob.bytes)
+        };
+        for voxel in [None, Some(0.5)] {
+            assert!(export(0, voxel).unwrap() > 12);
+            assert!(matches!(export(u64::MAX, voxel), Err(ExportError::LowDisk)));
+        }
+        let folders = std::fs::read_dir(at.dir.path().join("blobs")).unwrap();
+        let partial = folders.filter(|entry| entry.as_ref().unwrap().path().is_file()).count();
+        assert_eq!(partial, 0, "what was begun is gone");
+    }
 }

@@ -102,21 +102,26 @@ impl Certificates {
                 () = tokio::time::sleep(LOOK) => false,
                 () = stop.cancelled() => return,
             };
-            let found = stamp(&self.chain, &self.key);
-            if !asked && found == self.known {
-                continue;
-            }
-            match read(&self.chain, &self.key) {
-                Ok(new) => {
-                    *self.current.0.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(new);
-                    self.known = found;
-                    tracing::info!(file = %self.chain.display(), "the certificate was read again");
-                }
+            match self.read_again(asked) {
+                Ok(false) => {}
+                Ok(true) => tracing::info!(file = %self.chain.display(), "the certificate was read again"),
                 Err(error) => {
                     tracing::error!(%error, "the new certificate cannot be used; the old one stays");
                 }
             }
         }
+    }
+
+    /// Shows new connections what is in the files, if that changed or if `asked`. Returns whether they were read.
+    fn read_again(&mut self, asked: bool) -> Result<bool, TlsError> {
+        let found = stamp(&self.chain, &self.key);
+        if !asked && found == self.known {
+            return Ok(false);
+        }
+        let new = read(&self.chain, &self.key)?;
+        *self.current.0.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(new);
+        self.known = found;
+        Ok(true)
     }
 }
 
@@ -137,4 +142,43 @@ fn read(chain: &Path, key: &Path) -> Result<CertifiedKey, TlsError> {
     }
     let secret = PrivateKeyDer::from_pem_file(key).map_err(unreadable(key))?;
     Ok(CertifiedKey::from_der(certificates, secret, &default_provider())?)
+}
+
+#[cfg(test)]
+mod tests {
+    use rcgen::{CertifiedKey as Issued, generate_simple_self_signed};
+
+    use super::*;
+
+    /// Writes a new certificate and its key, in that order, and returns the certificate and what is to be written as key.
+    fn issue(folder: &Path) -> (CertificateDer<'static>, String) {
+        let Issued { cert, signing_key } = generate_simple_self_signed(["localhost".to_owned()]).unwrap();
+        fs::write(folder.join("cert.pem"), cert.pem()).unwrap();
+        (cert.der().clone(), signing_key.serialize_pem())
+    }
+
+    #[tokio::test]
+    async fn a_certificate_whose_key_is_not_there_yet_is_not_shown_and_one_that_is_whole_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let key = dir.path().join("key.pem");
+        let (first, first_key) = issue(dir.path());
+        fs::write(&key, first_key).unwrap();
+        let mut certificates = Certificates::open(&dir.path().join("cert.pem"), &key).unwrap();
+        let current = Arc::clone(&certificates.current);
+        let shown = || current.0.read().unwrap().cert[0].clone();
+        assert!(!certificates.read_again(false).unwrap(), "nothing has changed");
+
+        let (second, second_key) = issue(dir.path());
+        for asked in [true, false] {
+            assert!(matches!(certificates.read_again(asked), Err(TlsError::Unusable(_))));
+            assert_eq!(shown(), first);
+        }
+        fs::write(&key, second_key).unwrap();
+        assert!(certificates.read_again(false).unwrap());
+        assert_eq!(shown(), second);
+
+        fs::write(dir.path().join("cert.pem"), "").unwrap();
+        assert!(certificates.read_again(true).is_err());
+        assert_eq!(shown(), second);
+    }
 }

@@ -15,7 +15,7 @@ use crate::http::extract::Ids;
 use crate::http::job::JobBody;
 use crate::http::link::Link;
 use crate::http::problem::{Problem, Problems};
-use crate::http::query::{Params, cursor};
+use crate::http::query::{Params, next};
 use crate::http::router::Api;
 use crate::http::scan::ScanBody;
 use crate::project::{Name, ProjectId, Timestamp, Upload, UploadId};
@@ -97,7 +97,7 @@ pub(in crate::http) async fn list_uploads(
     query.finish()?;
     api.store.project(project).await?;
     let found = api.store.open_uploads(project, page).await?;
-    let next = found.last().filter(|_| found.len() == page.limit as usize).map(|(at, _)| cursor(*at));
+    let next = next(page, &found);
     let items = found.into_iter().map(|(_, upload)| ResumableBody::new(upload, None, None)).collect();
     Ok(Json(ResumableList { items, next }))
 }
