@@ -13,7 +13,7 @@ use crate::http::{
     self, Access, Api, Certificates, Entrance, Openness, Rates, TlsError, openapi_yaml, router,
 };
 use crate::jobs::webhooks::{Courier, SendError};
-use crate::jobs::{Compute, Exports, Intake, Resumable, Workers};
+use crate::jobs::{Compute, Demand, Exports, Intake, Resumable, Workers};
 use crate::storage::{StorageError, Store};
 
 /// Why the service does not start.
@@ -105,6 +105,7 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
     let stop = CancellationToken::new();
     let intake = Intake::new(store.clone(), config.intake);
     let metrics = Arc::default();
+    let demand = Arc::new(Demand::new(config.spare_core_at));
     let api = Api {
         store: store.clone(),
         resumable: Resumable::new(store.clone(), intake.clone(), config.upload_expiry, stop.clone()),
@@ -123,11 +124,12 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         },
         webhooks: Arc::new(config.webhooks.targets.clone()),
         metrics: Arc::clone(&metrics),
+        demand: Arc::clone(&demand),
         readiness: Arc::default(),
         stop: stop.clone(),
         openapi: Arc::from(openapi_yaml().map_err(|problem| StartError::Description(problem.detail))?),
     };
-    let workers = Workers::start(store.clone(), compute, config.workers)
+    let workers = Workers::start(store.clone(), compute, config.workers, demand)
         .await
         .map_err(|error| StartError::Data(config.data.clone(), error))?;
     tracing::info!(%addr, data = %config.data.display(), "listening");

@@ -7,6 +7,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::signals::{INTERRUPTED, signal};
 use crate::config::Settings;
+use crate::jobs::answer_promptly;
 use crate::{app, telemetry};
 
 /// Run the service
@@ -25,6 +26,8 @@ pub fn run(args: ServeArgs) -> anyhow::Result<()> {
     let file = args.config.as_deref().map(Settings::from_file).transpose()?.unwrap_or_default();
     let config = Settings { program: Some(this_program()), ..args.settings.or(file) }.resolve()?;
     let _telemetry = telemetry::init(config.log_json)?;
+    // Before there are threads: they inherit it.
+    answer_promptly();
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
         let running = app::start(config).await?;

@@ -45,6 +45,8 @@ pub struct Config {
     pub connections: ConnectionLimits,
     /// How often one address may ask.
     pub rates: RateLimits,
+    /// Requests a second from which on jobs leave a core to answers; 0: never.
+    pub spare_core_at: u64,
     /// Who is believed when it says for whom it asks.
     pub proxies: Proxies,
     /// When no more work is taken on.
@@ -138,6 +140,7 @@ impl Settings {
                 requests_per_second: rate("requests-per-second", self.requests_per_second.unwrap_or(200))?,
                 failures_per_minute: rate("failures-per-minute", self.failures_per_minute.unwrap_or(30))?,
             },
+            spare_core_at: within("spare-core-at", self.spare_core_at.unwrap_or(20), 0, 1 << 20)?,
             proxies: Proxies(listed("trusted-proxies", self.trusted_proxies)?),
             load: LoadLimits {
                 open_jobs: within("max-open-jobs", self.max_open_jobs.unwrap_or(100_000), 1, 1 << 40)?,
@@ -176,9 +179,10 @@ fn machine_memory() -> u64 {
     kib.map_or(8 << 30, |kib| kib.saturating_mul(1024)).min(container)
 }
 
-/// What each of so many workers may use of this machine's memory, bytes: three quarters of it between them.
+/// What each of so many workers may use of this machine's memory, bytes: three quarters of it between them and the processes that wait,
+/// which take a quarter of one's share while all are at work.
 fn share_of_machine(workers: u64) -> u64 {
-    (machine_memory() / 4 * 3 / workers.max(1)).max(LEAST_MEMORY)
+    (machine_memory() / (4 * workers + 1) * 3).max(LEAST_MEMORY)
 }
 
 #[cfg(test)]
@@ -196,9 +200,12 @@ mod tests {
     #[test]
     fn workers_share_the_memory_of_the_machine() {
         let of = |workers| Settings { workers: Some(workers), ..Settings::default() }.resolve().unwrap();
-        let (one, four) = (of(1).workers.memory_bytes, of(4).workers.memory_bytes);
-        assert!(four <= one && (four == LEAST_MEMORY || 4 * four <= one), "{four} {one}");
-        assert_eq!(of(256).workers.memory_bytes, (one / 256).max(LEAST_MEMORY));
+        for workers in [1, 4, 256] {
+            let share = of(workers).workers.memory_bytes;
+            let all = share * workers as u64 + share / 4;
+            assert!(share == LEAST_MEMORY || all <= machine_memory() / 4 * 3, "{workers}: {share}");
+        }
+        assert!(of(4).workers.memory_bytes <= of(1).workers.memory_bytes);
     }
 
     #[test]

@@ -82,6 +82,9 @@ pub struct Settings {
     /// Requests a second from one address, ten seconds' worth of them at once; more are refused with 429, 0 is no limit [default: 200]
     #[arg(long, env = "CAIRN_REQUESTS_PER_SECOND", value_name = "N")]
     pub requests_per_second: Option<u64>,
+    /// Requests a second, of all together, from which on jobs leave one core to answers; 0: never [default: 20]
+    #[arg(long, env = "CAIRN_SPARE_CORE_AT", value_name = "N")]
+    pub spare_core_at: Option<u64>,
     /// Requests a minute from one address with keys that open nothing; more are refused with 429, 0 is no limit [default: 30]
     #[arg(long, env = "CAIRN_FAILURES_PER_MINUTE", value_name = "N")]
     pub failures_per_minute: Option<u64>,
@@ -159,6 +162,7 @@ impl Settings {
                 .max_connections_per_address
                 .or(other.max_connections_per_address),
             requests_per_second: self.requests_per_second.or(other.requests_per_second),
+            spare_core_at: self.spare_core_at.or(other.spare_core_at),
             failures_per_minute: self.failures_per_minute.or(other.failures_per_minute),
             trusted_proxies: self.trusted_proxies.or(other.trusted_proxies),
             idle_seconds: self.idle_seconds.or(other.idle_seconds),

@@ -27,7 +27,7 @@ use super::{
     page, pose, preview, project, scan, shield, tus, upload, webhook,
 };
 use crate::jobs::webhooks::Targets;
-use crate::jobs::{Exports, Intake, Resumable};
+use crate::jobs::{Demand, Exports, Intake, Resumable};
 use crate::storage::Store;
 
 /// What handlers work with. Clones share everything.
@@ -47,6 +47,8 @@ pub struct Api {
     pub webhooks: Arc<Targets>,
     /// What is counted.
     pub metrics: Arc<Metrics>,
+    /// How much is asked for at this moment.
+    pub demand: Arc<Demand>,
     /// Whether requests make sense now.
     pub readiness: Arc<Readiness>,
     /// Cancelled when the service begins to stop: long answers end then.

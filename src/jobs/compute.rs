@@ -6,6 +6,8 @@ use std::sync::{Arc, PoisonError, RwLock};
 
 use tokio::sync::oneshot;
 
+use super::precedence::yield_to_clients;
+
 /// A computation panicked. It is caught here: the job fails, the process lives.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("the computation panicked: {0}")]
@@ -56,13 +58,6 @@ fn build(threads: usize) -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildErro
         .thread_name(|i| format!("compute-{i}"))
         .start_handler(|_| yield_to_clients())
         .build()
-}
-
-/// Lets those who answer clients go first: this thread, and those that it starts, get what they leave. On Linux, where niceness is a
-/// thread's; elsewhere it does as much as the system allows.
-pub fn yield_to_clients() {
-    // Being refused only means that answers are slower while much is computed.
-    let _ = rustix::process::nice(10);
 }
 
 /// What a panic said, if it said it in words.

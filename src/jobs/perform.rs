@@ -19,7 +19,7 @@ use super::register::register;
 use super::remove::remove;
 use super::session::Task;
 use super::workers::WorkerOptions;
-use super::{Compute, JobError};
+use super::{Compute, Demand, JobError};
 use crate::control::CancelToken;
 use crate::project::{Fault, JobKind, Lane};
 use crate::storage::{Claim, Lease, StorageError, Store};
@@ -32,6 +32,8 @@ pub(super) struct Performer {
     pub models: Arc<ModelCache>,
     /// Where jobs get processes of their own.
     pub processes: Arc<Processes>,
+    /// How much clients ask for at this moment.
+    pub demand: Arc<Demand>,
     pub options: WorkerOptions,
     pub stop: CancellationToken,
     /// How long a job that was told to stop is waited for.
@@ -54,6 +56,9 @@ pub(super) enum Interruption {
 /// How long a job that was told to stop is waited for in the service. The core looks at its token every few tens of milliseconds;
 /// writing what it has just finished may take longer.
 pub(super) const PATIENCE: Duration = Duration::from_secs(20);
+
+/// How long it takes until the end of a job that could not be written down is written again.
+const WRITE_AGAIN: Duration = Duration::from_secs(1);
 
 /// An upload may take so long to be decoded and prepared, however small it is …
 const INGEST_AT_LEAST: Duration = Duration::from_mins(2);
@@ -122,20 +127,33 @@ impl Performer {
     }
 
     async fn end(&self, lease: &Lease, result: Result<(), JobError>) {
-        told(match result {
-            Ok(()) => {
-                tracing::info!("job's stage is done");
-                Ok(())
-            }
+        match result {
+            Ok(()) => tracing::info!("job's stage is done"),
             Err(JobError::Lost | JobError::Cancelled(_)) => {
                 tracing::info!("job is let go");
-                self.store.release(lease).await
+                self.write_down(|| self.store.release(lease)).await;
             }
             Err(JobError::Failed { fault, retry }) => {
                 tracing::warn!(code = fault.code, detail = fault.detail, ?retry, "job fails");
-                self.store.fail(lease, &fault, retry).await
+                self.write_down(|| self.store.fail(lease, &fault, retry)).await;
             }
-        });
+        }
+    }
+
+    /// Writes down how a job ended, again and again while disk or database do not take it, until the claim runs out anyway.
+    pub async fn write_down<W: Future<Output = Result<(), StorageError>>>(&self, write: impl Fn() -> W) {
+        let until = Instant::now() + self.options.lease;
+        loop {
+            let written = write().await;
+            let passes = written.as_ref().is_err_and(|error| error.trouble().is_some());
+            if !passes || Instant::now() >= until || self.stop.is_cancelled() {
+                return told(written);
+            }
+            tokio::select! {
+                () = tokio::time::sleep(WRITE_AGAIN) => {}
+                () = self.stop.cancelled() => {}
+            }
+        }
     }
 
     /// Renews the claim and shows progress until the claim is lost, its time is over, or the pool stops.

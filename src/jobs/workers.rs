@@ -1,15 +1,15 @@
 //! The worker pool: loops that claim jobs and have them done (see `perform`), and those that keep the store in order.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::Compute;
 use super::isolated::{Isolated, Isolation};
 use super::perform::{PATIENCE, Performer};
+use super::{Compute, Demand};
 use crate::project::Lane;
 use crate::storage::{Claim, StorageError, Store};
 
@@ -58,8 +58,13 @@ pub struct Workers {
 struct Pool(Performer);
 
 impl Workers {
-    /// Takes back what a dead process left claimed, then starts the loops.
-    pub async fn start(store: Store, compute: Compute, options: WorkerOptions) -> Result<Self, StorageError> {
+    /// Takes back what a dead process left claimed, then starts the loops. While `demand` is high, processes of jobs leave a core to answers.
+    pub async fn start(
+        store: Store,
+        compute: Compute,
+        options: WorkerOptions,
+        demand: Arc<Demand>,
+    ) -> Result<Self, StorageError> {
         let left = store.reclaim(true, isolates(&options)).await?;
         if left > 0 {
             tracing::info!(jobs = left, "jobs of a process that ended are taken up again");
@@ -73,6 +78,7 @@ impl Workers {
             compute,
             models,
             processes: Arc::default(),
+            demand,
             options,
             stop: stop.clone(),
             patience: PATIENCE,
@@ -161,7 +167,8 @@ impl Pool {
         }
     }
 
-    /// Deletes files that nothing needs any more and sees to damaged ones, from time to time: nobody waits for it.
+    /// Deletes files that nothing needs any more, sees to damaged ones, and ends processes that wait for nothing, from time to time: nobody
+    /// waits for it.
     async fn collect(&self) {
         let mut tick = tokio::time::interval(self.0.options.collect_every);
         let mut walk = tokio::time::interval(WALK_EVERY);
@@ -178,6 +185,7 @@ impl Pool {
                 }
                 () = self.0.stop.cancelled() => return,
             }
+            self.0.processes.retire(Instant::now());
             if let Err(error) = self.0.store.settle_damage().await {
                 tracing::error!(%error, "damage cannot be written down");
             }

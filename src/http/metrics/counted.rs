@@ -150,6 +150,7 @@ pub(in crate::http) async fn observe(State(api): State<Api>, request: Request, n
     let route = request.extensions().get::<MatchedPath>().map_or("none", MatchedPath::as_str).to_owned();
     let method = known(request.method()).to_owned();
     let begun = Instant::now();
+    api.demand.asked();
     let response = next.run(request).await;
     let labels = [("method", method.clone()), ("route", route.clone())];
     api.metrics.request_seconds.get_or_create(&labels).observe(begun.elapsed().as_secs_f64());

@@ -11,9 +11,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::memory::taken_by;
 use super::message::{Order, Report};
-use crate::jobs::Compute;
 use crate::jobs::perform::Performer;
 use crate::jobs::workers::WorkerOptions;
+use crate::jobs::{Compute, Demand};
 use crate::storage::{StorageError, Store};
 
 /// How long a job that was told to stop is waited for. The service is less patient when a client has dismissed it.
@@ -35,6 +35,7 @@ pub async fn work_for_service(
         compute,
         models: Arc::default(),
         processes: Arc::default(),
+        demand: Arc::new(Demand::new(0)),
         options,
         stop: CancellationToken::new(),
         patience: PATIENCE,

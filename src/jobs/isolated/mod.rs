@@ -6,6 +6,7 @@
 //! was dismissed, and ends with the service. If it dies, that counts against its job; a job that is suspect gets a process that nobody
 //! used before or will use after it.
 
+mod cores;
 mod inside;
 mod memory;
 mod message;
@@ -20,6 +21,7 @@ use std::time::Duration;
 use serde::Deserialize;
 use tokio::time::Instant;
 
+use cores::Cores;
 pub use inside::work_for_service;
 use memory::taken_by;
 pub use message::{Order, Report};
@@ -50,7 +52,7 @@ pub struct Isolated {
     pub which: Isolation,
     /// This program.
     pub program: PathBuf,
-    /// Threads that compute in it.
+    /// Threads that compute in it; 0 is one for each core.
     pub threads: usize,
     /// Whether it logs as JSON.
     pub log_json: bool,
@@ -99,8 +101,8 @@ impl Performer {
     /// Has the job done by a process of its own, and sees to it that it ends.
     pub async fn perform_isolated(&self, isolated: &Isolated, lane: Lane, claim: Claim) {
         let (lease, project) = (claim.lease.clone(), claim.job.project);
-        let _at_work = self.processes.begin(lane, project, &self.options);
-        let (mut process, limit) = match self.begin(isolated, lane, &claim).await {
+        let (at_work, known) = self.processes.begin(lane, project, claim.suspect, &self.options);
+        let (mut process, limit) = match self.begin(isolated, lane, &claim, known).await {
             Ok(begun) => begun,
             Err(error) => {
                 tracing::error!(error, "no process could be started for a job");
@@ -136,29 +138,28 @@ impl Performer {
             }
         };
         if kept && !claim.suspect {
-            self.processes.keep(process, project, &self.options);
+            self.processes.keep(at_work, process, project, &self.options, std::time::Instant::now());
         } else {
             process.kill().await;
+            drop(at_work);
         }
-        told(match verdict {
-            Verdict::Settled => self.store.release(&lease).await,
-            Verdict::NotNow => self.store.postpone(&lease).await,
-            Verdict::Crashed(fault) => self.store.crashed(&lease, &fault).await,
-        });
-        self.store.relay(lease.all());
+        match verdict {
+            Verdict::Settled => self.write_down(|| self.store.release(&lease)).await,
+            Verdict::NotNow => self.write_down(|| self.store.postpone(&lease)).await,
+            Verdict::Crashed(fault) => self.write_down(|| self.store.crashed(&lease, &fault)).await,
+        }
+        self.store.relay_freed(lease.all());
     }
 
-    /// Finds or starts a process and has it begin. Returns how long it may take, too.
+    /// Has a process begin, a new one if none is known. Returns how long it may take, too.
     async fn begin(
         &self,
         isolated: &Isolated,
         lane: Lane,
         claim: &Claim,
+        known: Option<Process>,
     ) -> Result<(Process, Duration), String> {
         let limit = self.time_limit(lane, claim).await.map_err(|e| e.to_string())?;
-        let known = (!claim.suspect)
-            .then(|| self.processes.take(lane, claim.job.project, self.options.workers))
-            .flatten();
         let order = Order::Work { job: claim.job.id, attempt: claim.lease.attempt };
         let mut process = match known {
             Some(process) => process,
@@ -170,16 +171,19 @@ impl Performer {
         Ok((process, limit))
     }
 
-    /// Watches the claim while a process works on it, and passes on what clients wait for.
+    /// Watches the claim while a process works on it, passes on what clients wait for, and has it make room for them.
     async fn watch(&self, claim: &Claim, limit: Duration, process: Option<u32>) -> Interruption {
         // The process stops by itself when its time is over; it is killed if it does not.
         let limit = limit + STOPPING;
         let mut changes = self.store.changes();
         let mut tick = tokio::time::interval(self.options.progress_every);
         let (begun, mut seen) = (Instant::now(), claim.job.revision);
+        let mut cores = Cores::default();
         loop {
             tokio::select! {
-                _ = tick.tick() => {}
+                _ = tick.tick() => if let Some(process) = process {
+                    cores.spare_one(process, self.demand.is_high(std::time::Instant::now()));
+                },
                 change = changes.recv() => {
                     if change.is_ok_and(|id| claim.lease.all().all(|own| own != id)) {
                         continue;

@@ -1,6 +1,7 @@
 //! A process that does jobs, as the service holds it.
 
 use std::io;
+use std::num::NonZero;
 use std::path::Path;
 use std::process::{ExitStatus, Stdio};
 
@@ -10,29 +11,31 @@ use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use super::Isolated;
 use super::memory::taken_by;
 use super::message::{Order, Report};
+use super::pool::Resident;
 use crate::jobs::workers::WorkerOptions;
 use crate::project::{Lane, ProjectId};
 
 /// A process that does one job after the other. It is killed when this is dropped, and ends by itself when the service does,
 /// however that ends: it listens to a pipe that the service holds open.
 #[derive(Debug)]
-pub(super) struct Process {
+pub(in crate::jobs) struct Process {
     child: Child,
     orders: ChildStdin,
     reports: Lines<BufReader<ChildStdout>>,
-    /// The lane whose jobs it does.
-    pub lane: Lane,
-    /// The projects that it worked on, the last one last: it may hold their models.
-    pub worked_on: Vec<ProjectId>,
+    lane: Lane,
+    worked_on: Vec<ProjectId>,
 }
 
 impl Process {
     /// Starts a process that waits for orders.
     pub fn start(isolated: &Isolated, options: &WorkerOptions, data: &Path, lane: Lane) -> io::Result<Self> {
+        // Counted here: a process that leaves a core to others when it starts would see too few for all its life.
+        let all = || std::thread::available_parallelism().map_or(1, NonZero::get);
+        let threads = if isolated.threads == 0 { all() } else { isolated.threads };
         let mut command = Command::new(&isolated.program);
         command.arg("work").arg("--data").arg(data);
         for (flag, value) in [
-            ("--threads", isolated.threads.to_string()),
+            ("--threads", threads.to_string()),
             ("--max-points", options.max_points.to_string()),
             ("--memory-bytes", options.memory_bytes.to_string()),
             ("--lease-seconds", options.lease.as_secs().max(1).to_string()),
@@ -52,16 +55,6 @@ impl Process {
     /// What the system calls it, while it runs.
     pub fn id(&self) -> Option<u32> {
         self.child.id()
-    }
-
-    /// Whether it has not ended.
-    pub fn lives(&mut self) -> bool {
-        matches!(self.child.try_wait(), Ok(None))
-    }
-
-    /// Memory that it takes at this moment, bytes; 0 where the system does not tell.
-    pub fn memory(&self) -> u64 {
-        self.id().and_then(taken_by).unwrap_or(0)
     }
 
     /// Tells it what to do.
@@ -85,5 +78,23 @@ impl Process {
         if let Err(error) = self.child.kill().await {
             tracing::error!(%error, "the process of a job cannot be killed");
         }
+    }
+}
+
+impl Resident for Process {
+    fn lives(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
+    fn memory(&self) -> u64 {
+        self.id().and_then(taken_by).unwrap_or(0)
+    }
+
+    fn lane(&self) -> Lane {
+        self.lane
+    }
+
+    fn worked_on(&mut self) -> &mut Vec<ProjectId> {
+        &mut self.worked_on
     }
 }

@@ -16,6 +16,7 @@ use std::time::Duration;
 use clap::Args;
 use serde_json::json;
 
+use crate::jobs::answer_promptly;
 use clients::Crowd;
 use figures::{Figures, Latencies, median};
 use service::Service;
@@ -53,6 +54,8 @@ const QUIET_POLLS: usize = 1000;
 
 /// Runs the command.
 pub(super) fn run(args: &LoadArgs) -> anyhow::Result<ExitCode> {
+    // Clients are elsewhere and wait for no processor of the service's machine.
+    answer_promptly();
     tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(measure(args))
 }
 

@@ -1,0 +1,96 @@
+//! How much is asked of the service at this moment: `http` tells of every request, and `isolated` leaves a core to their answers while
+//! there are many.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// The time over which requests are counted.
+const WINDOW: Duration = Duration::from_secs(1);
+/// How long after much was asked it is taken that much will be.
+const LASTS: Duration = Duration::from_secs(5);
+
+/// Requests, and whether there are many.
+#[derive(Debug)]
+pub struct Demand {
+    /// Requests a second that are many; 0: no number is.
+    many: u64,
+    asked: AtomicU64,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    window: Instant,
+    /// Requests before the window.
+    before: u64,
+    /// When it stops that there are many.
+    until: Instant,
+}
+
+impl Demand {
+    /// So many requests a second are many; 0: no number is.
+    #[must_use]
+    pub fn new(many: u64) -> Self {
+        let now = Instant::now();
+        let state = Mutex::new(State { window: now, before: 0, until: now });
+        Self { many, asked: AtomicU64::new(0), state }
+    }
+
+    /// Counts a request.
+    pub fn asked(&self) {
+        self.asked.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Whether many requests came lately.
+    pub(super) fn is_high(&self, now: Instant) -> bool {
+        if self.many == 0 {
+            return false;
+        }
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let passed = now.saturating_duration_since(state.window);
+        if passed >= WINDOW {
+            let asked = self.asked.load(Ordering::Relaxed);
+            if (asked - state.before) as f64 >= self.many as f64 * passed.as_secs_f64() {
+                state.until = now + LASTS;
+            }
+            (state.window, state.before) = (now, asked);
+        }
+        now < state.until
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn demand_is_high_while_many_ask_and_a_little_longer() {
+        let demand = Demand::new(3);
+        let mut now = Instant::now();
+        let mut second = |requests: usize| {
+            (0..requests).for_each(|_| demand.asked());
+            now += WINDOW;
+            demand.is_high(now)
+        };
+        assert_eq!([0, 2, 1].map(&mut second), [false; 3]);
+        assert_eq!([4, 0, 0, 0, 0].map(&mut second), [true; 5]);
+        assert!(!second(2));
+        assert!(second(3) && second(0));
+    }
+
+    #[test]
+    fn nobody_looks_for_long_and_a_few_requests_since_are_not_many() {
+        let demand = Demand::new(3);
+        let now = Instant::now();
+        (0..20).for_each(|_| demand.asked());
+        assert!(!demand.is_high(now + 10 * WINDOW));
+    }
+
+    #[test]
+    fn no_number_is_many_if_none_is_said_to_be() {
+        let demand = Demand::new(0);
+        (0..1000).for_each(|_| demand.asked());
+        assert!(!demand.is_high(Instant::now() + WINDOW));
+    }
+}
