@@ -12,7 +12,9 @@ use crate::geometry::Pose;
 use crate::graph::ScanGraph;
 
 /// What was bent may violate free space this many times as much as a straight join. Wrong joins do so more than twice as much.
-const LENIENCE: f64 = 1.3;
+const LENIENCE: f64 = 1.5;
+/// Dense adjustments, each of the pairs that overlap as the one before left them.
+const DENSE_ROUNDS: usize = 2;
 
 /// A join of two components that are each a little bent, so that no rigid motion fits all that they share: they are joined on
 /// trial, adjusted together, and judged as they then stand. `None` when that does not help, or when another pose is nearly as well supported.
@@ -32,7 +34,9 @@ pub fn bent_join(
     joined.absorb(b.clone(), &clearest_start(graph, (a, b), candidate, voxel), graph, options);
     let before = joined.clone();
     pose_graph(graph, &mut joined, Reach::FAR, voxel, options, control)?;
-    dense(graph, &mut joined, None, Reach::FAR, voxel, control)?;
+    for _ in 0..DENSE_ROUNDS {
+        dense(graph, &mut joined, None, Reach::FAR, voxel, control)?;
+    }
     if !thrown(graph, &before, &joined, options).is_empty() {
         return Ok(None);
     }

@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::candidates::DECIDED;
 use super::component::Component;
 use super::options::MappingOptions;
+use super::voice::{Voice, Word, one_voice};
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 use crate::graph::{Edge, ScanGraph, softplus};
@@ -209,8 +210,9 @@ const NO_SUPPORT: f64 = 1e-6;
 const WITNESS: f64 = 2.0;
 /// A pair speaks against a component only if its pose differs by this many times what makes a rival.
 pub const CLEARLY_DIFFERENT: f64 = 2.0;
-/// A component is contradicted when what is said against it, beyond a witness's least, comes to this for each witness for it …
-const CONTRADICTED_WEIGHT: f64 = 0.05;
+/// A component is contradicted when what is said against it with one voice, beyond a witness's least, comes to this for each witness for
+/// it …
+const CONTRADICTED_WEIGHT: f64 = 0.03;
 /// … and at least to this, …
 const CONTRADICTED_LEAST: f64 = 3.0;
 /// … by at least this many pairs.
@@ -239,15 +241,17 @@ pub struct Testimony {
     pub agreeing: usize,
     /// Pairs that are sure of another, the surest first.
     pub contradictions: Vec<Contradiction>,
+    /// Of these, what most say alike.
+    pub voice: Voice,
 }
 
 impl Testimony {
-    /// Whether too much is said against the component for it to be right. Where all is right, chance says at most 0.03 for each
-    /// witness; where alike rooms were folded onto each other it is 0.05 and more, mostly far more.
+    /// Whether too much is said against the component for it to be right. Where all is right, chance says a different thing each time, at
+    /// most 0.012 for each witness; where alike rooms were folded onto each other, one voice says 0.04 and more, mostly far more.
     #[must_use]
     pub fn condemns(&self) -> bool {
-        let weight: f64 = self.contradictions.iter().map(|c| c.evidence - WITNESS).sum();
-        self.contradictions.len() >= CONTRADICTED_PAIRS
+        let weight = self.voice.evidence - WITNESS * self.voice.pairs as f64;
+        self.voice.pairs >= CONTRADICTED_PAIRS
             && weight >= (CONTRADICTED_WEIGHT * self.agreeing as f64).max(CONTRADICTED_LEAST)
     }
 
@@ -298,6 +302,8 @@ pub fn testimony(graph: &ScanGraph, component: &Component, options: &MappingOpti
         }
     }
     found.contradictions.sort_by(|x, y| y.evidence.total_cmp(&x.evidence).then(x.pair.cmp(&y.pair)));
+    let words = Word::both_ways(graph, component, &found.contradictions, options);
+    found.voice = one_voice(&words, options.rival_angle);
     found
 }
 
@@ -326,6 +332,27 @@ mod tests {
         let (side, cut) = separating_cut(&six(), &supports, key(6), key(1)).unwrap();
         assert_eq!(side, BTreeSet::from([key(6)]));
         assert!((cut - 0.2).abs() < 1e-9);
+    }
+
+    #[test]
+    fn what_pairs_say_by_chance_does_not_add_up_but_one_voice_condemns() {
+        let said = |evidence: f64| Contradiction {
+            pair: PairKey::of(ScanKey(1), ScanKey(2)),
+            a_from_b: Pose::identity(),
+            evidence,
+            angle: 3.0,
+            distance: 4.0,
+        };
+        let contradictions: Vec<Contradiction> = [8.0, 6.0, 5.0, 4.0].map(said).to_vec();
+        let voiced = |pairs: usize, evidence: f64| Testimony {
+            agreeing: 100,
+            contradictions: contradictions.clone(),
+            voice: Voice { pairs, evidence },
+        };
+        assert!(!voiced(1, 8.0).condemns());
+        assert!(voiced(3, 15.0).condemns());
+        // Two that hardly believe it themselves are still chance.
+        assert!(!voiced(2, 4.5).condemns());
     }
 
     #[test]

@@ -29,6 +29,7 @@ mod track_refinement;
 mod tracks;
 mod undecided;
 mod undo;
+mod voice;
 
 pub use decision::{Decision, Decisions, Verdict};
 pub use join::Refusal;

@@ -38,13 +38,16 @@ pub struct Reach {
     pose_graph_voxels: f64,
     /// First gate of the dense adjustment, in voxels.
     first_gate_voxels: f64,
+    /// An edge takes part in the pose graph up to this many times as far from the poses as what makes a rival.
+    edge_rivals: f64,
 }
 
 impl Reach {
     /// A little off, as a model is that only grew.
-    pub const NEAR: Self = Self { pose_graph_voxels: 1.6, first_gate_voxels: 4.0 };
-    /// Bent by accumulated errors of edges, each small: edges share them out instead of breaking at one.
-    pub const FAR: Self = Self { pose_graph_voxels: 8.0, first_gate_voxels: 10.0 };
+    pub const NEAR: Self = Self { pose_graph_voxels: 1.6, first_gate_voxels: 4.0, edge_rivals: 1.0 };
+    /// Bent by accumulated errors of edges, each small: edges share them out instead of breaking at one, and an edge that closes a loop
+    /// takes part however far the errors around the loop have carried its ends.
+    pub const FAR: Self = Self { pose_graph_voxels: 8.0, first_gate_voxels: 16.0, edge_rivals: 3.0 };
 }
 
 /// The scans of a component by index, as the optimisers count them.
@@ -210,9 +213,11 @@ pub fn pose_graph(
         };
         let Some(b) = graph.scan(edge.pair.b) else { continue };
         let now = indexed.poses[i].inverse() * indexed.poses[j];
+        let (most_angle, most_distance) =
+            (reach.edge_rivals * options.rival_angle, reach.edge_rivals * options.rival_voxels * voxel);
         let agreeing = edge.hypotheses.iter().find(|h| {
             let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, &now, &b.centroid);
-            angle < options.rival_angle && distance < options.rival_voxels * voxel
+            angle < most_angle && distance < most_distance
         });
         if let Some(h) = agreeing.filter(|h| h.score > 0.0) {
             edges.push(PoseEdge {

@@ -1,11 +1,9 @@
 //! Taking back what later evidence contradicts. Where the pairs that speak against a component all speak against one join in it, or its
 //! sides turn out to stand in each other's free space, that join is undone and its pose is not tried again; where they are too many for
-//! that, alike places were folded onto each other: nothing there can be told from its twin, so nothing is kept, and the scans wait
-//! until a new scan or a decision changes what is known.
+//! that, and say the same, alike places were folded onto each other: nothing there can be told from its twin, so nothing is kept, and the
+//! scans wait until a new scan or a decision changes what is known.
 
 use std::collections::{BTreeMap, BTreeSet};
-
-use nalgebra::Vector3;
 
 use super::candidates::best_candidate;
 use super::component::Component;
@@ -17,14 +15,16 @@ use super::mapper::Mapper;
 use super::open_join::Undone;
 use super::options::MappingOptions;
 use super::undecided::{Undecided, smaller_side, undecided};
+use super::voice::{Word, one_voice};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
-use crate::geometry::Pose;
 use crate::graph::ScanGraph;
-use crate::pairwise::{PairKey, centred_difference};
 
 /// A join is undone when what pairs with one voice say against it comes to this share of its support …
 const AGAINST_SHARE: f64 = 0.5;
+/// … and without asking whether places are alike when it comes to this: of alike places, either has much for it. Where such were folded
+/// onto each other it comes to 1.2 at most.
+const OVERWHELMING_SHARE: f64 = 2.0;
 /// … and at least this many pairs say the same.
 const AGAINST_PAIRS: usize = 2;
 /// Contradictions whose separation is tried, the strongest first.
@@ -105,10 +105,14 @@ fn finding(
     options: &MappingOptions,
     control: Control<'_>,
 ) -> Result<Finding, Cancelled> {
+    let tear = |share: f64| tear(graph, component, supports, testimony, share, options);
+    if let Some((side, strongest)) = tear(OVERWHELMING_SHARE) {
+        return Ok(Finding::Torn { side, strongest });
+    }
     if let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) {
         return Ok(Finding::Folded { strongest: *strongest });
     }
-    if let Some((side, strongest)) = tear(graph, component, supports, testimony, options) {
+    if let Some((side, strongest)) = tear(AGAINST_SHARE) {
         return Ok(Finding::Torn { side, strongest });
     }
     match undecided(graph, component, testimony, voxel, options) {
@@ -124,72 +128,26 @@ fn finding(
     })
 }
 
-/// Where a component comes apart: the cut between two contradicting scans that holds least compared with what speaks against it, by its
-/// smaller side, and the pair that shows it.
+/// Where a component comes apart: a cut between two contradicting scans that what speaks against it with one voice outweighs by this share
+/// of its support, by its smaller side, and the pair that shows it.
 fn tear(
     graph: &ScanGraph,
     component: &Component,
     supports: &BTreeMap<(ScanKey, ScanKey), f64>,
     testimony: &Testimony,
+    share: f64,
     options: &MappingOptions,
 ) -> Option<(BTreeSet<ScanKey>, Contradiction)> {
     let inside: Vec<&Contradiction> = testimony.inside(component).collect();
     for strongest in inside.iter().take(TRIED) {
         let (side, support) = separating_cut(component, supports, strongest.pair.a, strongest.pair.b)?;
-        let across = inside.iter().filter(|c| side.contains(&c.pair.a) != side.contains(&c.pair.b));
-        let motions: Vec<Motion> =
-            across.filter_map(|c| motion(graph, component, &side, c, options)).collect();
-        let (pairs, against) = with_one_voice(&motions, options.rival_angle);
-        if pairs >= AGAINST_PAIRS && against >= AGAINST_SHARE * support {
+        let words = Word::on_side(graph, component, &side, &inside, options);
+        let against = one_voice(&words, options.rival_angle);
+        if against.pairs >= AGAINST_PAIRS && against.evidence >= share * support {
             return Some((smaller_side(component, side), **strongest));
         }
     }
     None
-}
-
-/// Where a contradicting pair would have its scan on the one side of a cut, were the other side to stay.
-struct Motion {
-    /// From where the side is to where it would be, in the frame of the component.
-    moved: Pose,
-    /// Centroid of the scan, metres, in the frame of the component.
-    centroid: Vector3<f64>,
-    /// Motions this far apart at the centroid are different, metres.
-    reach: f64,
-    evidence: f64,
-}
-
-fn motion(
-    graph: &ScanGraph,
-    component: &Component,
-    side: &BTreeSet<ScanKey>,
-    contradiction: &Contradiction,
-    options: &MappingOptions,
-) -> Option<Motion> {
-    let PairKey { a, b } = contradiction.pair;
-    let (a_from_b, b_from_a) = (contradiction.a_from_b, contradiction.a_from_b.inverse());
-    let (stays, moves, motion) = if side.contains(&b) { (a, b, a_from_b) } else { (b, a, b_from_a) };
-    let (stays, from_local) = (component.poses.get(&stays)?, component.poses.get(&moves)?);
-    let scan = graph.scan(moves)?;
-    Some(Motion {
-        moved: *stays * motion * from_local.inverse(),
-        centroid: from_local.transform(&scan.centroid),
-        reach: options.rival_voxels * scan.prepared.resolution,
-        evidence: contradiction.evidence,
-    })
-}
-
-/// Of several motions of one side, those that agree, as many as weigh most together: their number and their evidence. Pairs that are
-/// wrong by chance each say something else.
-fn with_one_voice(motions: &[Motion], angle: f64) -> (usize, f64) {
-    let agree = |x: &Motion, y: &Motion| {
-        let (turn, distance) = centred_difference(&x.moved, &y.moved, &x.centroid);
-        turn < angle && distance < x.reach
-    };
-    let voices = motions.iter().map(|x| {
-        let agreeing = motions.iter().filter(|y| agree(x, y));
-        agreeing.fold((0, 0.0), |(pairs, evidence), y| (pairs + 1, evidence + y.evidence))
-    });
-    voices.max_by(|x, y| x.1.total_cmp(&y.1)).unwrap_or((0, 0.0))
 }
 
 /// Forbids the pose that a join had, by its strongest edge.
@@ -288,26 +246,6 @@ fn firmest_path(supports: &BTreeMap<(ScanKey, ScanKey), f64>, from: ScanKey, to:
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn only_pairs_that_say_the_same_speak_with_one_voice() {
-        let motion = |x: f64, centroid: f64, evidence: f64| Motion {
-            moved: Pose::new(
-                nalgebra::Rotation3::from_axis_angle(&Vector3::z_axis(), 1.0),
-                Vector3::new(x, 0.0, 0.0),
-            ),
-            centroid: Vector3::new(centroid, 0.0, 0.0),
-            reach: 0.5,
-            evidence,
-        };
-        let mut motions = vec![motion(3.0, 7.0, 2.5), motion(3.2, -4.0, 2.6), motion(-1.0, 0.0, 4.0)];
-        let (pairs, evidence) = with_one_voice(&motions, 0.25);
-        assert_eq!(pairs, 2);
-        assert!((evidence - 5.1).abs() < 1e-12);
-        motions[1].moved = motions[1].moved.inverse();
-        assert_eq!(with_one_voice(&motions, 0.25), (1, 4.0));
-        assert_eq!(with_one_voice(&[], 0.25), (0, 0.0));
-    }
 
     #[test]
     fn the_proof_goes_around_by_the_firmest_edges() {
