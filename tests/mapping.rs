@@ -6,10 +6,12 @@ use std::sync::Arc;
 use cairn::cloud::ScanKey;
 use cairn::control::{CancelToken, Control, Seed, Silent};
 use cairn::features::{
-    PrepareOptions, PreparedScan, SensorPosition, choose_resolution, natural_resolution, prepare,
+    PrepareOptions, PreparedScan, Scan, SensorPosition, Stance, choose_resolution, natural_resolution,
+    prepare,
 };
 use cairn::geometry::Pose;
 use cairn::mapping::{Decision, LiveModel, MappingOptions, ModelSnapshot, ScanOutcome};
+use cairn::pairwise::{match_pair, shipped_verifier};
 use cairn::simulate::{BuildingOptions, Layout, SurveyOptions, simulate};
 
 /// Prepared scans and the true `model_from_scan` of each.
@@ -19,16 +21,20 @@ struct Truth {
 }
 
 fn survey(building: BuildingOptions, stations: usize, seed: u64) -> Truth {
-    let options = SurveyOptions { building, stations, seed: Seed(seed), ..SurveyOptions::default() };
-    let survey = simulate(&options).unwrap();
+    scanned(&SurveyOptions { building, stations, seed: Seed(seed), ..SurveyOptions::default() }, None)
+}
+
+fn scanned(options: &SurveyOptions, up: Option<[f64; 3]>) -> Truth {
+    let survey = simulate(options).unwrap();
     let natural: Vec<f64> = survey.scans.iter().map(|s| natural_resolution(&s.cloud.points)).collect();
     let settings = PrepareOptions::at(choose_resolution(&natural), Seed(0));
+    let stance = Stance { position: SensorPosition::Assumed, up };
     let mut truth = Truth { scans: Vec::new(), poses: BTreeMap::new() };
     let token = CancelToken::new();
     for scan in &survey.scans {
         let key = ScanKey::of_hash(&blake3::hash(scan.name.as_bytes()), &[]);
         let control = Control { cancel: &token, observer: &Silent };
-        let prepared = prepare(key, &scan.cloud, SensorPosition::Assumed, &settings, control).unwrap();
+        let prepared = prepare(key, &scan.cloud, stance, &settings, control).unwrap();
         truth.scans.push(Arc::new(prepared));
         truth.poses.insert(key, scan.model_from_scan);
     }
@@ -135,4 +141,45 @@ fn the_model_is_the_same_at_one_and_at_two_threads() {
         pool.install(|| registered(&truth).snapshot())
     };
     assert_eq!(at(1), at(2));
+}
+
+#[test]
+fn colours_tell_the_ends_of_a_hall_apart_that_nothing_else_does() {
+    let hall = |colored| {
+        let building = BuildingOptions { layout: Layout::Hall, ..BuildingOptions::default() };
+        let options =
+            SurveyOptions { building, stations: 12, colored, seed: Seed(101), ..SurveyOptions::default() };
+        scanned(&options, None)
+    };
+    let grey = registered(&hall(false)).snapshot();
+    assert!(
+        grey.scans.values().all(|scan| matches!(scan, ScanOutcome::Waiting(_))),
+        "grey halls are symmetric"
+    );
+    let truth = hall(true);
+    let colored = registered(&truth).snapshot();
+    for scan in &truth.scans {
+        let (degrees, metres) = error(&colored, &truth, truth.scans[0].key, scan.key).expect("one component");
+        assert!(degrees < 2.0 && metres < 0.2, "{degrees} deg, {metres} m");
+    }
+}
+
+#[test]
+fn levelled_scans_are_registered_upright_from_fewer_poses() {
+    let building = BuildingOptions { rooms: 2, ..BuildingOptions::default() };
+    let options = SurveyOptions { building, stations: 6, seed: Seed(3), ..SurveyOptions::default() };
+    let poses = |truth: &Truth| {
+        let scans: Vec<Scan> = truth.scans.iter().map(|scan| Scan::new(scan.as_ref().clone())).collect();
+        let pairs = scans.iter().enumerate().flat_map(|(i, x)| scans[..i].iter().map(move |y| (x, y)));
+        pairs.map(|(x, y)| match_pair(x, y, &shipped_verifier()).hypotheses).collect::<Vec<_>>()
+    };
+    let (free, levelled) = (scanned(&options, None), scanned(&options, Some([0.0, 0.0, 1.0])));
+    let tips_over = |pose: &Pose| pose.rotation.matrix()[(2, 2)] < 0.9;
+    assert!(poses(&free).iter().flatten().any(|h| tips_over(&h.a_from_b)));
+    assert!(!poses(&levelled).iter().flatten().any(|h| tips_over(&h.a_from_b)));
+    let model = registered(&levelled).snapshot();
+    for scan in &levelled.scans {
+        let (_, metres) = error(&model, &levelled, levelled.scans[0].key, scan.key).expect("one component");
+        assert!(metres < 0.1);
+    }
 }

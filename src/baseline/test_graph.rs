@@ -94,12 +94,14 @@ fn scan(k: usize) -> PreparedScan {
         origin: [0.0; 3],
         points: vec![[0.5, 0.0, 1.0], [1.5, 0.5, 1.0]],
         normals: vec![[0.0, 0.0, 1.0]; 2],
+        colors: Vec::new(),
         keypoints: Vec::new(),
         descriptors: Vec::new(),
         signature: Vec::new(),
         range_image: None,
         viewpoint: [0.0; 3],
         hidden_share: 0.0,
+        up: None,
     }
 }
 

@@ -11,7 +11,7 @@ use super::view::View;
 use crate::control::{Cancelled, Control, Stage};
 use crate::features::{PreparedScan, Scan};
 use crate::graph::{ScanGraph, SupportOptions, triplet_features};
-use crate::pairwise::{Evidence, Logistic, PairResult, Verifier};
+use crate::pairwise::{Appearance, Evidence, Logistic, PairResult, Verifier};
 
 /// Places are dealt to so many folds; each is predicted by a fit on the others.
 const FOLDS: usize = 5;
@@ -57,6 +57,8 @@ pub struct Fit {
     pub pair: Logistic,
     /// On a pair and what third scans say.
     pub triplet: Logistic,
+    /// On colours, beside what a pair says without them; `None` where no two scans have any.
+    pub appearance: Option<Logistic>,
     /// Of every labelled hypothesis, by regressions that saw no scene of its place.
     pub held_out: Vec<Prediction>,
 }
@@ -98,8 +100,10 @@ impl Fit {
         }
         held_out.sort_by_key(|p| p.scene);
         let triplet = without(&[], &examples)?;
+        let on_colors: Vec<Vec<Example>> = judged.iter().map(|judged| appearance_examples(judged)).collect();
+        let appearance = fit(&pooled(on_colors.iter()));
         step(steps)?;
-        Ok(Self { pair, triplet, held_out })
+        Ok(Self { pair, triplet, appearance, held_out })
     }
 }
 
@@ -140,7 +144,7 @@ fn pair_examples(scene: &MatchedScene) -> Vec<Example> {
         let seen = evidence.filter_map(|(hypothesis, label)| {
             let evidence = view.of(&hypothesis.evidence)?;
             let features = evidence.features(scene.resolution).to_vec();
-            Some(Example { features, right: label.is_right()?, weight: view.weight() })
+            Some(Example { features, offset: 0.0, right: label.is_right()?, weight: view.weight() })
         });
         examples.extend(seen);
     }
@@ -152,8 +156,25 @@ fn pair_examples(scene: &MatchedScene) -> Vec<Example> {
 fn triplet_examples(judged: &[Judged]) -> Vec<Example> {
     let mut examples: Vec<Example> = judged
         .iter()
-        .map(|j| Example { features: j.features.clone(), right: j.right, weight: j.view.weight() })
+        .map(|j| Example {
+            features: j.features.clone(),
+            offset: 0.0,
+            right: j.right,
+            weight: j.view.weight(),
+        })
         .collect();
+    share_out(&mut examples);
+    examples
+}
+
+/// What is to be learned from colours, given what pairs say without them: log-odds that are out of fold.
+fn appearance_examples(judged: &[Judged]) -> Vec<Example> {
+    let full = judged.iter().filter(|j| j.view == View::Full);
+    let colored = full.filter_map(|j| {
+        let features = j.appearance?.features().to_vec();
+        Some(Example { features, offset: j.features[0], right: j.right, weight: 1.0 })
+    });
+    let mut examples: Vec<Example> = colored.collect();
     share_out(&mut examples);
     examples
 }
@@ -162,7 +183,7 @@ fn triplet_examples(judged: &[Judged]) -> Vec<Example> {
 /// hall of twelve scans say as much as sixty fragments, and examples that count alike would let one scene say most.
 fn share_out(examples: &mut [Example]) {
     let total: f64 = examples.iter().map(|e| e.weight).sum();
-    let scale = (examples.len() as f64).sqrt() / total;
+    let scale = (examples.len() as f64).sqrt() / total.max(f64::MIN_POSITIVE);
     for example in examples {
         example.weight *= scale;
     }
@@ -185,6 +206,8 @@ struct Judged {
     right: bool,
     /// Of the second regression; the first of them is the pair's log-odds.
     features: Vec<f64>,
+    /// How colours agree ([`Evidence::appearance`]).
+    appearance: Option<Appearance>,
 }
 
 fn predictions(scene: usize, judged: &[Judged], triplet: &Logistic) -> Vec<Prediction> {
@@ -224,7 +247,8 @@ fn hypotheses(scene: &MatchedScene, pair: &Logistic) -> Vec<Judged> {
                 if let Some(right) = label
                     && differs(&supported.hypothesis.evidence)
                 {
-                    judged.push(Judged { view, right, features: features.to_vec() });
+                    let appearance = supported.hypothesis.evidence.appearance;
+                    judged.push(Judged { view, right, features: features.to_vec(), appearance });
                 }
             }
         }
@@ -251,12 +275,14 @@ fn outline(scan: &ScanOutline, resolution: f64) -> Scan {
         origin: [0.0; 3],
         points: Vec::new(),
         normals: Vec::new(),
+        colors: Vec::new(),
         keypoints: Vec::new(),
         descriptors: Vec::new(),
         signature: Vec::new(),
         range_image: None,
         viewpoint: [0.0; 3],
         hidden_share: 0.0,
+        up: None,
     };
     Scan { centroid: scan.centroid.into(), ..Scan::new(prepared) }
 }

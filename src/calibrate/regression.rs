@@ -19,6 +19,8 @@ const HALVINGS: usize = 12;
 pub(super) struct Example {
     /// Features as the regression takes them.
     pub features: Vec<f64>,
+    /// Log-odds from elsewhere, to which the regression adds; 0 if it is to say all.
+    pub offset: f64,
     /// Whether the pose is right.
     pub right: bool,
     /// How much it counts; 1 on average.
@@ -96,7 +98,8 @@ impl State {
         let terms: Vec<f64> = block.iter().flat_map(|e| logistic.terms(&e.features)).collect();
         // One column an example.
         let terms = DMatrix::from_vec(weights.len(), block.len(), terms);
-        let logits = terms.tr_mul(weights);
+        let offsets = DVector::from_iterator(block.len(), block.iter().map(|e| e.offset));
+        let logits = terms.tr_mul(weights) + offsets;
         let mut weighted = terms.clone();
         let (mut loss, mut residuals) = (0.0, DVector::zeros(block.len()));
         for (i, (example, logit)) in block.iter().zip(logits.iter()).enumerate() {
@@ -125,7 +128,7 @@ mod tests {
             .map(|i| {
                 let (x, y) = (f64::from(i % 30) / 10.0 - 1.5, f64::from(i / 30) / 10.0 - 1.5);
                 let right = x * x + y * y < 1.0;
-                Example { features: vec![x, y], right, weight: weight(right) }
+                Example { features: vec![x, y], offset: 0.0, right, weight: weight(right) }
             })
             .collect()
     }
@@ -145,6 +148,18 @@ mod tests {
             [1.0, 9.0].map(|w| fit(&disc(|right| if right { w } else { 1.0 })).expect("both labels"));
         let border = [1.0, 0.0];
         assert!(heavy.logit(&border) > plain.logit(&border) + 0.5);
+    }
+
+    #[test]
+    fn what_is_known_already_is_not_learned_again() {
+        let mut examples = disc(|_| 1.0);
+        let alone = fit(&examples).expect("both labels");
+        for example in &mut examples {
+            example.offset = alone.logit(&example.features);
+        }
+        let more = fit(&examples).expect("both labels");
+        let most = |of: &Logistic| examples.iter().map(|e| of.logit(&e.features).abs()).fold(0.0, f64::max);
+        assert!(most(&more) < 0.2 * most(&alone), "{} {}", most(&more), most(&alone));
     }
 
     #[test]

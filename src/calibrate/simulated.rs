@@ -74,6 +74,7 @@ impl Sketch {
             stations: self.stations.min(most_stations),
             least_overlap: self.least_overlap,
             people: self.people,
+            colored: true,
             seed,
             ..SurveyOptions::default()
         }

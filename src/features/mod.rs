@@ -1,6 +1,7 @@
 //! What is computed once per scan: normals, keypoints, descriptors, global signature, and the dense structures
 //! (voxel index, range image) that verification reads. Uses `cloud` and `geometry`; used by `pairwise` and above.
 
+mod color;
 mod fpfh;
 mod keypoints;
 mod planes;
@@ -16,5 +17,5 @@ pub use planes::{Offsets, PlaneProfile};
 pub use prepared::{PrepareError, PrepareOptions, PreparedScan, Scan, prepare};
 pub use range_image::{RangeImage, Visibility};
 pub use resolution::{choose_resolution, extent, natural_resolution};
-pub use sensor::{SensorPosition, Surfaces, Viewpoint, viewpoint};
+pub use sensor::{SensorPosition, Stance, Surfaces, Viewpoint, viewpoint};
 pub use signature::{SIGNATURE_LEN, signature};

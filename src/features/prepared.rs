@@ -4,12 +4,13 @@
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
+use super::color::thinned_colors;
 use super::fpfh::{Descriptor, fpfh};
 use super::keypoints::select_keypoints;
 use super::planes::PlaneProfile;
 use super::range_image::RangeImage;
 use super::resolution::extent;
-use super::sensor::{SensorPosition, Surfaces, viewpoint};
+use super::sensor::{Stance, Surfaces, viewpoint};
 use super::signature::signature;
 use crate::cloud::{PointCloud, ScanKey, face, normals};
 use crate::control::{Cancelled, Control, Seed};
@@ -77,7 +78,7 @@ pub enum PrepareError {
     Cancelled(#[from] Cancelled),
 }
 
-/// A scan made ready for matching: serialisable, and a pure function of (cloud, sensor position, options).
+/// A scan made ready for matching: serialisable, and a pure function of (cloud, stance of the sensor, options).
 ///
 /// Its points live in the *local* frame: the axes of the scan's own frame, shifted by `origin` so that single precision holds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -92,6 +93,8 @@ pub struct PreparedScan {
     pub points: Vec<Point>,
     /// Unit normals of `points`, facing the sensor.
     pub normals: Vec<Point>,
+    /// Colours of `points`, red, green, blue; none where the file has none.
+    pub colors: Vec<[u8; 3]>,
     /// Indices of the keypoints in `points`, ascending.
     pub keypoints: Vec<u32>,
     /// Descriptors of the keypoints, one after the other, each [`DESCRIPTOR_LEN`](super::DESCRIPTOR_LEN) long.
@@ -104,6 +107,8 @@ pub struct PreparedScan {
     pub viewpoint: Point,
     /// Share of the points that are hidden from the viewpoint.
     pub hidden_share: f64,
+    /// Against gravity, a unit vector in the axes of both frames, if somebody said.
+    pub up: Option<[f64; 3]>,
 }
 
 impl PreparedScan {
@@ -169,11 +174,11 @@ impl Scan {
 pub fn prepare(
     key: ScanKey,
     cloud: &PointCloud,
-    sensor: SensorPosition,
+    sensor: impl Into<Stance>,
     options: &PrepareOptions,
     control: Control<'_>,
 ) -> Result<PreparedScan, PrepareError> {
-    let resolution = options.resolution;
+    let (resolution, stance) = (options.resolution, sensor.into());
     if !(resolution > 0.0 && resolution.is_finite()) {
         return Err(PrepareError::Resolution(resolution));
     }
@@ -197,8 +202,11 @@ pub fn prepare(
         resolution: v,
         extent: extent(&fine) as f32,
     };
-    let view = viewpoint(&surfaces, sensor, frame_origin);
+    let view = viewpoint(&surfaces, stance.position, frame_origin);
     control.check()?;
+    let mut colors = thinned_colors(&cloud.points, &cloud.colors, &coarse, v);
+    let mut has_normal = raw_normals.iter().map(Option::is_some);
+    colors.retain(|_| has_normal.next() == Some(true));
     let (points, normals): (Vec<Point>, Vec<Point>) = coarse
         .iter()
         .zip(raw_normals)
@@ -220,11 +228,13 @@ pub fn prepare(
         origin: cloud.origin,
         points,
         normals,
+        colors,
         keypoints,
         descriptors,
         signature,
         range_image: view.range_image,
         viewpoint: view.position,
         hidden_share: view.hidden_share,
+        up: stance.up.and_then(|up| Some(Vector3::from(up).try_normalize(f64::MIN_POSITIVE)?.into())),
     })
 }

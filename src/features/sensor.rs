@@ -35,6 +35,21 @@ pub enum SensorPosition {
     Known([f64; 3]),
 }
 
+/// How the sensor stood while it took the scan, as far as somebody said.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Stance {
+    /// Where.
+    pub position: SensorPosition,
+    /// Against gravity, in the scan's own frame, of any length but zero.
+    pub up: Option<[f64; 3]>,
+}
+
+impl From<SensorPosition> for Stance {
+    fn from(position: SensorPosition) -> Self {
+        Self { position, up: None }
+    }
+}
+
 /// A viewpoint and what was seen from it.
 #[derive(Debug, Clone)]
 pub struct Viewpoint {

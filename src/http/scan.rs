@@ -47,6 +47,8 @@ pub(super) struct ScanBody {
     metres_per_unit: f64,
     /// Where the sensor stood, in the scan's own frame, metres, if the client said so.
     sensor_position: Option<[f64; 3]>,
+    /// Against gravity, in the scan's own frame, if the client said so.
+    up: Option<[f64; 3]>,
     /// Points, once decoded.
     points: Option<u64>,
     /// Diagonal of the box that holds the middle 96 % of each coordinate, metres, once decoded.
@@ -91,6 +93,7 @@ impl From<Scan> for ScanBody {
             blake3: s.blob,
             metres_per_unit: s.interpretation.metres_per_unit,
             sensor_position: s.interpretation.sensor_position,
+            up: s.interpretation.up,
             points: s.points,
             extent: s.extent,
             job: s.job,

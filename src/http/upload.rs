@@ -18,7 +18,7 @@ use super::query::Params;
 use super::router::Api;
 use super::scan::ScanBody;
 use crate::jobs::{UploadRequest, metres_per_unit};
-use crate::project::{BadInterpretation, Interpretation, Name, ProjectId};
+use crate::project::{BadInterpretation, Interpretation, Name, ProjectId, three_numbers};
 
 /// An acknowledged upload.
 #[derive(Debug, Serialize, ToSchema)]
@@ -39,6 +39,7 @@ pub(super) struct UploadBody {
     ("name" = String, Query, description = "What to call the scan, such as its file name", min_length = 1, max_length = 200),
     ("units" = Option<String>, Query, description = "Unit of its coordinates: mm, cm, m, km, in, ft, us-ft, or metres in one unit; m if absent", min_length = 1),
     ("sensor_position" = Option<String>, Query, description = "Where the sensor stood, in the scan's own frame, metres: x,y,z"),
+    ("up" = Option<String>, Query, description = "Against gravity, in the scan's own frame: x,y,z, of any length; believed to within 3 degrees"),
     ("content-digest" = Option<String>, Header, description = "RFC 9530: sha-256 or sha-512 of the body; a body that differs is refused")),
     request_body(content = Bytes, content_type = "application/octet-stream", description = "The file: PLY, PCD, XYZ or PTS"),
     responses(
@@ -97,20 +98,19 @@ pub(super) fn name(params: &mut Params, otherwise: Option<String>) -> Result<Nam
     Name::parse(&text).map_err(|e| Problem::invalid("name", e.to_string()))
 }
 
-/// `units` and `sensor_position`.
+/// `units`, `sensor_position` and `up`.
 pub(super) fn interpretation(query: &mut Params) -> Result<Interpretation, Problem> {
     let units =
         query.with("units", "mm, cm, m, km, in, ft, us-ft, or metres in one unit", metres_per_unit)?;
-    let sensor_position = query.with("sensor_position", "three numbers in metres: x,y,z", |text| {
-        let numbers: Vec<f64> = text.split(',').map(|t| t.trim().parse().ok()).collect::<Option<_>>()?;
-        <[f64; 3]>::try_from(numbers).ok()
-    })?;
-    let interpretation = Interpretation { metres_per_unit: units.unwrap_or(1.0), sensor_position };
+    let sensor_position = query.with("sensor_position", "three numbers in metres: x,y,z", three_numbers)?;
+    let up = query.with("up", "three numbers: x,y,z", three_numbers)?;
+    let interpretation = Interpretation { metres_per_unit: units.unwrap_or(1.0), sensor_position, up };
     match interpretation.validate() {
         Ok(()) => Ok(interpretation),
         Err(e @ BadInterpretation::Units(_)) => Err(Problem::invalid("units", e.to_string())),
         Err(e @ BadInterpretation::SensorPosition(_)) => {
             Err(Problem::invalid("sensor_position", e.to_string()))
         }
+        Err(e @ BadInterpretation::Up(_)) => Err(Problem::invalid("up", e.to_string())),
     }
 }

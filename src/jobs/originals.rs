@@ -5,7 +5,7 @@ use std::io::BufReader;
 use super::JobError;
 use crate::cloud::{DecodeOptions, Decoded, decode};
 use crate::control::CancelToken;
-use crate::features::SensorPosition;
+use crate::features::{SensorPosition, Stance};
 use crate::project::Scan;
 use crate::storage::{BlobId, BlobStore};
 
@@ -13,8 +13,8 @@ use crate::storage::{BlobId, BlobStore};
 pub(super) struct Original {
     /// Points and what the file said about them.
     pub decoded: Decoded,
-    /// Where the sensor stood: the request's word, else the file's.
-    pub sensor: SensorPosition,
+    /// How the sensor stood: the request's word, else the file's.
+    pub stance: Stance,
 }
 
 /// Decodes the upload of a scan. Blocks; belongs into the thread pool.
@@ -35,6 +35,6 @@ pub(super) fn read_original(
     reader.into_inner().verify()?;
     let decoded = result?;
     let said = scan.interpretation.sensor_position.or(decoded.sensor_position);
-    let sensor = said.map_or(SensorPosition::Assumed, SensorPosition::Known);
-    Ok(Original { decoded, sensor })
+    let position = said.map_or(SensorPosition::Assumed, SensorPosition::Known);
+    Ok(Original { decoded, stance: Stance { position, up: scan.interpretation.up } })
 }

@@ -28,7 +28,7 @@ pub(super) fn draw(merge: &Merge) -> Result<Vec<u8>, ExportError> {
     let mut parts = Vec::with_capacity(merge.placed.len());
     for (scan, place) in &merge.placed {
         let original = read_original(&merge.blobs, scan, merge.max_points, &CancelToken::new())?;
-        let (cloud, sensor) = (original.decoded.cloud, original.sensor);
+        let (cloud, sensor) = (original.decoded.cloud, original.stance.position);
         let origin = Vector3::from(cloud.origin);
         let relative = |p: [f64; 3]| Point::from((Vector3::from(p) - origin).cast::<f32>());
         parts.push(Part {

@@ -70,7 +70,7 @@ pub(super) fn make(
     control: Control<'_>,
 ) -> Result<(Arc<PreparedScan>, FreshBlob), JobError> {
     let options = parameters.prepare_options();
-    let prepared = prepare(scan_key(scan.key), &original.decoded.cloud, original.sensor, &options, control)?;
+    let prepared = prepare(scan_key(scan.key), &original.decoded.cloud, original.stance, &options, control)?;
     let bytes = prepared.to_bytes().map_err(|e| JobError::for_good("internal-error", e))?;
     let stored = blobs.put(&bytes)?;
     Ok((Arc::new(prepared), stored))

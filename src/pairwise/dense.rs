@@ -9,10 +9,10 @@ use crate::features::Scan;
 use crate::geometry::Pose;
 
 /// A point with a point of the other scan this near, in voxels, lies on its surface if the normals agree …
-const NEAR_VOXELS: f32 = 2.4;
+pub(super) const NEAR_VOXELS: f32 = 2.4;
 const TIGHT_VOXELS: f32 = 1.2;
 /// … by this cosine. Normals more opposite than its negative are the other side of a thin wall and say nothing.
-const NORMAL_DOT: f32 = 0.6;
+pub(super) const NORMAL_DOT: f32 = 0.6;
 
 /// Counts over the points of one scan, seen against the other.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]

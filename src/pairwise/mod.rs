@@ -1,9 +1,11 @@
 //! Two scans: matching, consensus, hypotheses, dense and free-space verification, refinement of the pair. Uses `features`;
 //! used by `graph` and `mapping`.
 
+mod appearance;
 mod consensus;
 mod contacts;
 mod dense;
+mod gravity;
 mod icp;
 mod matching;
 mod pair;
@@ -12,9 +14,11 @@ mod probe;
 mod shortlist;
 mod verifier;
 
+pub use appearance::{Appearance, appearance};
 pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, agreement, centred_difference, consensus};
 pub(crate) use contacts::{Contacts, Motion};
 pub use dense::{Counts, look, quick_overlap};
+pub use gravity::is_upright;
 pub use icp::{icp, perturbed_about};
 pub use matching::{Match, mutual_matches};
 pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};

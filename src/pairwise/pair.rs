@@ -2,8 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::appearance::appearance;
 use super::consensus::{INLIER_VOXELS, agreement, centred_difference};
 use super::dense::look;
+use super::gravity::is_upright;
 use super::icp::icp;
 use super::matching::mutual_matches;
 use super::shortlist::shortlist;
@@ -72,7 +74,7 @@ pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
             let (angle, distance) = centred_difference(&h.a_from_b, &a_from_b, &b.centroid);
             angle < SAME_ANGLE && distance < SAME_VOXELS * a.prepared.resolution
         });
-        if known {
+        if known || !is_upright(a, b, &a_from_b) {
             continue;
         }
         let agreeing = agreement(a, b, &matches, &a_from_b);
@@ -83,8 +85,9 @@ pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
             match_inliers: agreeing.inliers as u32,
             matches: matches.len() as u32,
             range_images: [a, b].iter().filter(|scan| scan.prepared.range_image.is_some()).count() as u32,
+            appearance: appearance(a, b, &a_from_b),
         };
-        let logit = verifier.pair.logit(&evidence.features(a.prepared.resolution));
+        let logit = verifier.pair_logit(&evidence, a.prepared.resolution);
         hypotheses.push(Hypothesis { a_from_b, evidence, logit });
     }
     hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));

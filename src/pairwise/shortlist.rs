@@ -4,6 +4,7 @@
 
 use super::consensus::{Consensus, ConsensusOptions, agreement, centred_difference, consensus};
 use super::dense::look;
+use super::gravity::is_upright;
 use super::matching::Match;
 use super::planar::planar_poses;
 use crate::features::Scan;
@@ -29,10 +30,12 @@ const AGREEMENT: f64 = 1.7;
 #[must_use]
 pub fn shortlist(a: &Scan, b: &Scan, matches: &[Match], count: usize) -> Vec<Consensus> {
     let mut candidates = consensus(a, b, matches, &ConsensusOptions::default());
+    candidates.retain(|candidate| is_upright(a, b, &candidate.a_from_b));
     // Without any range image planes that are flush cannot be told from planes that are the same.
     if [a, b].iter().any(|scan| scan.prepared.range_image.is_some()) {
         let mut planar: Vec<(f64, Pose)> = planar_poses(a, b, PLANAR_POSES)
             .into_iter()
+            .filter(|pose| is_upright(a, b, pose))
             .map(|pose| (glance(a, b, &pose, FIRST_LOOK), pose))
             .collect();
         planar.sort_by(|x, y| y.0.total_cmp(&x.0));

@@ -8,12 +8,19 @@ use std::sync::{Arc, LazyLock};
 
 use serde::{Deserialize, Serialize};
 
+use super::appearance::Appearance;
 use super::dense::{Counts, share};
 
 /// Numbers that describe the evidence for a pose.
 pub const FEATURES: usize = 15;
 /// Numbers that the second regression takes: what the first one says, and what third scans do (`graph::triplet_features`).
 pub const TRIPLET_FEATURES: usize = 5;
+
+/// Numbers that the regression on colours takes.
+pub const APPEARANCE_FEATURES: usize = 2;
+/// Colours lower the log-odds by this at most: light, and what sensors make of it, vary more than any calibration shows. They never
+/// raise them: places that are painted alike are many.
+const MOST_AGAINST: f64 = 3.0;
 
 /// Everything known about one hypothesis of a pair, as counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -30,6 +37,8 @@ pub struct Evidence {
     pub matches: u32,
     /// Of the two scans, how many say what their sensor saw: without that, no violation means nothing.
     pub range_images: u32,
+    /// How alike the colours are that meet, if both scans have enough of them.
+    pub appearance: Option<Appearance>,
 }
 
 impl Evidence {
@@ -62,6 +71,14 @@ impl Evidence {
             self.b_on_a.overlap().max(self.a_on_b.overlap()),
             f64::from(self.range_images),
         ]
+    }
+}
+
+impl Appearance {
+    /// The features of the regression on colours.
+    #[must_use]
+    pub fn features(&self) -> [f64; APPEARANCE_FEATURES] {
+        [self.correlation, self.by_chance].map(f64::from)
     }
 }
 
@@ -162,6 +179,9 @@ pub struct Verifier {
     pub pair: Logistic,
     /// On a pair and what third scans say.
     pub triplet: Logistic,
+    /// On the colours that meet: what they take from the log-odds of a pair. Without it colours say nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub appearance: Option<Logistic>,
 }
 
 /// Why a text is no verifier.
@@ -173,7 +193,7 @@ pub enum VerifierError {
     /// It was fitted on other features than this engine measures.
     #[error("the {regression} regression does not take {features} features with a weight for each term")]
     Features {
-        /// `pair` or `triplet`.
+        /// `pair`, `triplet` or `appearance`.
         regression: &'static str,
         /// What this engine measures.
         features: usize,
@@ -184,14 +204,25 @@ impl Verifier {
     /// Reads a verifier from JSON, the form in which it is serialised.
     pub fn parse(json: &str) -> Result<Self, VerifierError> {
         let verifier: Self = serde_json::from_str(json)?;
-        let regressions =
-            [("pair", &verifier.pair, FEATURES), ("triplet", &verifier.triplet, TRIPLET_FEATURES)];
-        for (regression, logistic, features) in regressions {
+        let always = [("pair", &verifier.pair, FEATURES), ("triplet", &verifier.triplet, TRIPLET_FEATURES)];
+        let on_colors = verifier.appearance.iter().map(|of| ("appearance", of, APPEARANCE_FEATURES));
+        for (regression, logistic, features) in always.into_iter().chain(on_colors) {
             if !logistic.fits(features) {
                 return Err(VerifierError::Features { regression, features });
             }
         }
         Ok(verifier)
+    }
+
+    /// The log-odds that a pose is right, from the pair alone; `voxel` is the resolution in metres.
+    #[must_use]
+    pub fn pair_logit(&self, evidence: &Evidence, voxel: f64) -> f64 {
+        let by_colors = self
+            .appearance
+            .as_ref()
+            .zip(evidence.appearance)
+            .map_or(0.0, |(of, seen)| of.logit(&seen.features()).clamp(-MOST_AGAINST, 0.0));
+        self.pair.logit(&evidence.features(voxel)) + by_colors
     }
 }
 
@@ -233,6 +264,16 @@ mod tests {
     }
 
     #[test]
+    fn colours_lower_the_odds_of_a_pose_that_they_contradict_and_never_raise_them() {
+        let logit =
+            |appearance| shipped_verifier().pair_logit(&Evidence { appearance, ..Evidence::default() }, 0.05);
+        let seen = |correlation| Some(Appearance { correlation, by_chance: 0.05 });
+        assert!((logit(seen(0.9)) - logit(None)).abs() < 1e-12);
+        assert!(logit(seen(0.3)) < logit(None) - 1.0);
+        assert!((logit(seen(-1.0)) - logit(None) + MOST_AGAINST).abs() < 1e-12);
+    }
+
+    #[test]
     fn surfaces_that_coincide_are_likelier_right_than_surfaces_in_free_space() {
         let good =
             Counts { points: 4000, inliers: 2400, tight: 2000, plane_square: 0.4, ..Counts::default() };
@@ -252,6 +293,7 @@ mod tests {
             match_inliers,
             matches: 300,
             range_images: 2,
+            appearance: None,
         };
         let logit = |e: Evidence| shipped_verifier().pair.logit(&e.features(0.05));
         assert!(logit(evidence(good, 120)) > 2.0);

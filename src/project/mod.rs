@@ -23,7 +23,7 @@ pub use key::{Key, Limits, Reach, Scope};
 pub use model::{Component, Edge, ModelContent, Placement, Reason, Standing, Version};
 pub use name::{BadName, Name};
 pub use open_join::{OpenJoin, RivalPose, Undone};
-pub use scan::{BadInterpretation, ContentKey, Interpretation, Scan, ScanState};
+pub use scan::{BadInterpretation, ContentKey, Interpretation, Scan, ScanState, three_numbers};
 pub use settings::{BadSettings, Project, ProjectSettings};
 pub use time::Timestamp;
 pub use token::{BadToken, Digest, Token};

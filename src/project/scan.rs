@@ -17,6 +17,9 @@ pub struct Interpretation {
     pub metres_per_unit: f64,
     /// Where the sensor stood, in the scan's own frame, metres. `None`: as the file says, or its origin.
     pub sensor_position: Option<[f64; 3]>,
+    /// Against gravity, in the scan's own frame, of any length. `None`: nobody said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub up: Option<[f64; 3]>,
 }
 
 /// Why an interpretation is refused.
@@ -30,11 +33,14 @@ pub enum BadInterpretation {
         "a coordinate of the sensor position is {0} m; it must be finite and at most 10000000 m from zero"
     )]
     SensorPosition(f64),
+    /// No direction.
+    #[error("`up` is {0:?}; it must be three finite numbers whose length lies between 0.001 and 1000")]
+    Up([f64; 3]),
 }
 
 impl Default for Interpretation {
     fn default() -> Self {
-        Self { metres_per_unit: 1.0, sensor_position: None }
+        Self { metres_per_unit: 1.0, sensor_position: None, up: None }
     }
 }
 
@@ -44,8 +50,12 @@ impl Interpretation {
         if !(1e-6..=1e6).contains(&self.metres_per_unit) {
             return Err(BadInterpretation::Units(self.metres_per_unit));
         }
-        match self.sensor_position.iter().flatten().find(|x| !x.is_finite() || x.abs() > 1e7) {
-            Some(x) => Err(BadInterpretation::SensorPosition(*x)),
+        if let Some(x) = self.sensor_position.iter().flatten().find(|x| !x.is_finite() || x.abs() > 1e7) {
+            return Err(BadInterpretation::SensorPosition(*x));
+        }
+        let length = |up: &[f64; 3]| up.iter().map(|x| x * x).sum::<f64>().sqrt();
+        match self.up.filter(|up| !(1e-3..=1e3).contains(&length(up))) {
+            Some(up) => Err(BadInterpretation::Up(up)),
             None => Ok(()),
         }
     }
@@ -58,8 +68,21 @@ impl Interpretation {
         }
         let sensor = self.sensor_position.iter().flatten();
         // Adding zero turns -0 into 0, which is equal to it and must give equal bytes.
-        std::iter::once(&self.metres_per_unit).chain(sensor).flat_map(|x| (x + 0.0).to_le_bytes()).collect()
+        let bytes = |x: &f64| (x + 0.0).to_le_bytes();
+        let mut all: Vec<u8> = std::iter::once(&self.metres_per_unit).chain(sensor).flat_map(bytes).collect();
+        if let Some(up) = &self.up {
+            all.extend_from_slice(b"up");
+            all.extend(up.iter().flat_map(bytes));
+        }
+        all
     }
+}
+
+/// Reads `x,y,z`.
+#[must_use]
+pub fn three_numbers(text: &str) -> Option<[f64; 3]> {
+    let numbers: Vec<f64> = text.split(',').map(|t| t.trim().parse().ok()).collect::<Option<_>>()?;
+    numbers.try_into().ok()
 }
 
 /// How far a scan has come.
@@ -156,9 +179,23 @@ mod tests {
         let feet = Interpretation { metres_per_unit: 0.3048, ..default };
         let origin = Interpretation { sensor_position: Some([0.0; 3]), ..default };
         let minus = Interpretation { sensor_position: Some([-0.0, 0.0, 0.0]), ..default };
+        let upright = Interpretation { up: Some([0.0; 3]), ..default };
         assert!(default.to_bytes().is_empty());
         assert_ne!(feet.to_bytes(), origin.to_bytes());
+        assert_ne!(upright.to_bytes(), origin.to_bytes());
         assert_eq!(origin.to_bytes(), minus.to_bytes());
+    }
+
+    #[test]
+    fn a_direction_of_no_length_is_refused_and_what_was_stored_without_one_is_read() {
+        let up = |up| Interpretation { up: Some(up), ..Interpretation::default() }.validate();
+        assert_eq!(up([0.0, 0.0, 9.81]), Ok(()));
+        for bad in [[0.0; 3], [f64::INFINITY, 0.0, 0.0], [0.0, 1e-9, 0.0]] {
+            assert_eq!(up(bad), Err(BadInterpretation::Up(bad)));
+        }
+        assert!(up([f64::NAN, 0.0, 1.0]).is_err());
+        let stored = r#"{"metres_per_unit":0.001,"sensor_position":null}"#;
+        assert_eq!(serde_json::from_str::<Interpretation>(stored).unwrap().up, None);
     }
 
     #[test]

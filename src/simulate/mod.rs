@@ -22,6 +22,7 @@ mod acquire;
 mod building;
 mod draw;
 mod echo;
+mod exposure;
 mod facts;
 mod furnish;
 mod furniture;

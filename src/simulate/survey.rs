@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::acquire::{Surroundings, acquire};
 use super::building::{Building, BuildingError, BuildingOptions};
 use super::draw::Draw;
+use super::exposure::expose;
 use super::people::people_around;
 use super::scene::Scene;
 use super::sensor::{Sensor, SensorError};
@@ -30,7 +31,7 @@ pub struct SurveyOptions {
     pub least_overlap: f32,
     /// People around the sensor, elsewhere in every scan.
     pub people: usize,
-    /// Whether points have the colours of what they lie on.
+    /// Whether points have the colours of what they lie on, as exposed in each scan.
     pub colored: bool,
     /// Rigs that share the work; each scans its own part of the building.
     pub rigs: usize,
@@ -141,7 +142,8 @@ pub fn simulate(options: &SurveyOptions) -> Result<Survey, SurveyError> {
                 ghosts: options.building.hazards.ghosts(),
                 colored: options.colored,
             };
-            let cloud = acquire(&around, &options.sensor, &model_from_scan, seed, station as u64);
+            let mut cloud = acquire(&around, &options.sensor, &model_from_scan, seed, station as u64);
+            expose(&mut cloud.colors, &mut Draw::new(seed.derive("simulate.exposure", station as u128)));
             SimulatedScan { name, cloud, model_from_scan, rig, building: 0 }
         })
         .collect();

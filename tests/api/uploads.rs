@@ -79,6 +79,26 @@ async fn the_same_content_is_one_scan_and_read_otherwise_it_is_another() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn what_an_upload_says_of_its_sensor_is_kept_and_heard() {
+    let server = Server::start().await;
+    let project = server.project().await;
+    // The same room upright and, as it says, upside down: no pose may lay the one onto the other.
+    let told = server.upload(&project, "name=a.ply&up=0,0,2&sensor_position=0,-0.5,0.5", room(0.0)).await;
+    let told: Value = told.json().await.unwrap();
+    assert_eq!(told["scan"]["up"], serde_json::json!([0.0, 0.0, 2.0]));
+    assert_eq!(told["scan"]["sensor_position"], serde_json::json!([0.0, -0.5, 0.5]));
+    let other = server.upload(&project, "name=b.ply&up=0,0,-1", room(0.1)).await;
+    let other: Value = other.json().await.unwrap();
+    for answer in [&told, &other] {
+        server.ended(&answer["job"]).await;
+    }
+    let model = server.json(&format!("{project}/model")).await;
+    assert_eq!(model["components"], serde_json::json!([]), "{model}");
+    assert_eq!(server.accepted(&project, "c.ply", room(0.2)).await["scan"]["up"], Value::Null);
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn parameters_that_make_no_sense_are_named() {
     let server = Server::start().await;
     let project = server.project().await;
@@ -91,6 +111,8 @@ async fn parameters_that_make_no_sense_are_named() {
         ("name=a&units=1e300", "units"),
         ("name=a&sensor_position=1,2", "sensor_position"),
         ("name=a&sensor_position=1,2,nan", "sensor_position"),
+        ("name=a&up=0,0,0", "up"),
+        ("name=a&up=0,1", "up"),
         ("name=a&nmae=b", "nmae"),
     ] {
         let found = problem(server.upload(&project, query, room(0.0)).await, 400, "invalid-field").await;

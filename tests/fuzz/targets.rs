@@ -104,12 +104,13 @@ pub const JSON: [&str; 12] = [
     "-0.0",
     "\\u0000",
 ];
-pub const HEADERS: [&str; 16] = [
+pub const HEADERS: [&str; 17] = [
     "project MDFBUlozTkRFS1RTVjRSUkZGUTY5RzVGQVY=",
     "name YS5wbHk=",
     "filename YS54eXo=",
     "units bW0=",
     "sensor_position MSwyLDM=",
+    "up MCwwLDE=",
     "filetype bW9kZWwvcGx5",
     "sha1 ",
     "sha256 ",
@@ -176,6 +177,7 @@ pub fn prepared(mut input: &[u8]) -> String {
         Ok(scan) => {
             assert!(scan.points.iter().flatten().all(|x| x.is_finite()));
             assert!(scan.normals.iter().flatten().all(|x| x.is_finite()));
+            assert!(scan.colors.is_empty() || scan.colors.len() == scan.points.len());
             assert!(scan.descriptors.iter().all(|x| x.is_finite()));
             let planes = Scan::new(scan).planes.is_some();
             format!("prepared, planes {planes}")

@@ -188,8 +188,8 @@ fn load<'p>(
         .par_iter()
         .zip(names)
         .map(|(source, name)| {
-            let sensor = source.sensor(&interpretation);
-            let prepared = prepare(source.key, &source.decoded.cloud, sensor, &options, control)
+            let stance = source.stance(&interpretation);
+            let prepared = prepare(source.key, &source.decoded.cloud, stance, &options, control)
                 .with_context(|| format!("{name} of {scene}"))?;
             Ok(Scan::new(prepared))
         })

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 use clap::Args;
 
+use super::super::register::upward;
 use super::super::signals::{INTERRUPTED, cancelled_by_signal};
 use super::super::truth::read;
 use super::measure::{Rules, measured};
@@ -17,6 +18,7 @@ use super::{markdown, tables};
 use crate::control::{CancelToken, Cancelled, Control, Silent};
 use crate::evaluate::{Estimate, Tolerance};
 use crate::pairwise::{Verifier, shipped_verifier};
+use crate::project::Interpretation;
 
 /// Register scenes with known truth, and measure the results.
 ///
@@ -42,6 +44,9 @@ pub struct RecallArgs {
     /// Runs of each scene, each with the next seed
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub seeds: u64,
+    /// Against gravity in every scan's own frame, where scans are levelled [default: unknown]
+    #[arg(long, value_name = "X,Y,Z", value_parser = upward, allow_hyphen_values = true)]
+    pub up: Option<[f64; 3]>,
     /// Weights of the verifier instead of the shipped ones; one for all scenes, or one for each in their order (leave one out)
     #[arg(long, value_name = "FILE")]
     pub verifier: Vec<PathBuf>,
@@ -126,9 +131,11 @@ fn report(args: &RecallArgs, verifiers: &[Arc<Verifier>], cancel: &CancelToken) 
             strategies.push(*strategy);
         }
     }
+    let interpretation = Interpretation { up: args.up, ..Interpretation::default() };
+    interpretation.validate()?;
     let mut scenes = Vec::with_capacity(args.scenes.len());
     for (folder, verifier) in args.scenes.iter().zip(verifiers) {
-        let scene = Scene::read(folder, Control { cancel, observer: &Silent })?;
+        let scene = Scene::read(folder, interpretation, Control { cancel, observer: &Silent })?;
         let wrong_distance = args.wrong_distance.unwrap_or_else(|| scene.wrong_distance());
         let tolerance = Tolerance { rotation_deg: args.wrong_angle, translation_m: wrong_distance };
         let rules = Rules { tau_m: args.tau, tolerance };

@@ -34,6 +34,8 @@ pub(super) struct Scene {
     pub name: String,
     /// All scans, by the hash that the engine knows them by.
     pub scans: BTreeMap<ScanKey, DistinctScan>,
+    /// How their files are read.
+    pub interpretation: Interpretation,
     /// True poses; the component of each is the place that it is of.
     pub truth: Estimate,
     /// The pairs that benchmarks score, if the scene has such lists.
@@ -46,16 +48,16 @@ pub(super) struct Scene {
 
 impl Scene {
     /// Reads the truth, every scan once, and finds the pairs that overlap.
-    pub fn read(folder: &Path, control: Control<'_>) -> anyhow::Result<Self> {
+    pub fn read(folder: &Path, interpretation: Interpretation, control: Control<'_>) -> anyhow::Result<Self> {
         let files = scan_files(folder)?;
-        let (scans, unreadable) = measure(&files, &Interpretation::default(), control)?;
+        let (scans, unreadable) = measure(&files, &interpretation, control)?;
         if let Some((file, failure)) = unreadable.into_iter().next() {
             bail!("{}: {file}: {}", folder.display(), failure.detail);
         }
         let natural: Vec<f64> = scans.values().map(|scan| scan.natural).collect();
         let resolution = choose_resolution(&natural);
         let options = PrepareOptions::at(resolution, Seed::default());
-        let (prepared, _) = prepare_all(&scans, &Interpretation::default(), &options, control)?;
+        let (prepared, _) = prepare_all(&scans, &interpretation, &options, control)?;
         let surfaces: BTreeMap<&str, &PreparedScan> = prepared
             .iter()
             .filter_map(|scan| Some((scans.get(&scan.key)?.names.first()?.as_str(), scan.as_ref())))
@@ -71,7 +73,7 @@ impl Scene {
         let truth = tell_places_apart(known, &groups(folder)?, &surfaces);
         let overlapping = overlapping(&truth, &surfaces, resolution, control)?;
         let lists = pair_lists(folder)?;
-        Ok(Self { name: label(folder), scans, truth, lists, resolution, overlapping })
+        Ok(Self { name: label(folder), scans, interpretation, truth, lists, resolution, overlapping })
     }
 
     /// Half a metre, or ten voxels where that is less: what a wrong placement is scales with small objects, and never exceeds what

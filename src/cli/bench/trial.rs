@@ -21,7 +21,6 @@ use crate::graph::SupportOptions;
 use crate::jobs::DECIDING_SCANS;
 use crate::mapping::{LiveModel, MappingOptions, ModelSnapshot, ScanOutcome};
 use crate::pairwise::Verifier;
-use crate::project::Interpretation;
 
 /// How a run goes.
 #[derive(Debug, Clone)]
@@ -69,7 +68,7 @@ pub(super) fn run(scene: &Scene, course: &Course, cancel: &CancelToken) -> anyho
     let control = Control { cancel, observer: &clock };
     let begun = Moment::now();
     let settings = PrepareOptions::at(resolution, seed);
-    let (prepared, unfit) = prepare_all(&scene.scans, &Interpretation::default(), &settings, control)?;
+    let (prepared, unfit) = prepare_all(&scene.scans, &scene.interpretation, &settings, control)?;
     let prepare = begun.until(&Moment::now());
     ensure!(!prepared.is_empty(), "{}: none of the {} scans can be registered", scene.name, unfit.len());
     let mut by_key: BTreeMap<ScanKey, Arc<PreparedScan>> =

@@ -236,7 +236,12 @@ fn verifier(scenes: &[MatchedScene], kept: &[usize], fit: &Fit, command: &str) -
         command: command.to_owned(),
         scenes: kept.iter().map(|s| scenes[*s].provenance()).collect(),
     };
-    Verifier { provenance, pair: fit.pair.clone(), triplet: fit.triplet.clone() }
+    Verifier {
+        provenance,
+        pair: fit.pair.clone(),
+        triplet: fit.triplet.clone(),
+        appearance: fit.appearance.clone(),
+    }
 }
 
 /// A verifier as one line of JSON.

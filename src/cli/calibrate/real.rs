@@ -73,8 +73,8 @@ impl RealScene {
             .map(|(file, (world, world_from_scan))| {
                 let source = read(file)?;
                 let quiet = Control { observer: &Silent, ..control };
-                let sensor = source.sensor(&interpretation);
-                let prepared = prepare(source.key, &source.decoded.cloud, sensor, &options, quiet)
+                let stance = source.stance(&interpretation);
+                let prepared = prepare(source.key, &source.decoded.cloud, stance, &options, quiet)
                     .map_err(|error| explain(error.into(), &file.name))?;
                 let world_from_local = *world_from_scan * prepared.local_from_scan().inverse();
                 control.report(Stage::Prepare, 1 + done.fetch_add(1, Ordering::Relaxed), known.len());

@@ -22,7 +22,7 @@ use super::progress::{Moment, Watch};
 use super::signals::{INTERRUPTED, cancelled_by_signal};
 use crate::cloud::metres_per_unit;
 use crate::control::{Cancelled, Control, Seed};
-use crate::project::{Interpretation, ProjectSettings};
+use crate::project::{Interpretation, ProjectSettings, three_numbers};
 use output::Staging;
 use pipeline::Registration;
 use report::Report;
@@ -63,6 +63,9 @@ pub struct RegisterArgs {
     /// Unit of the coordinates: mm, cm, m, km, in, ft, us-ft, or metres in one unit
     #[arg(long, value_name = "UNIT", default_value = "m", value_parser = unit)]
     pub units: f64,
+    /// Against gravity in every scan's own frame, where scans are levelled, as 0,0,1 [default: unknown]
+    #[arg(long, value_name = "X,Y,Z", value_parser = upward, allow_hyphen_values = true)]
+    pub up: Option<[f64; 3]>,
     /// What you decided about pairs of scans that the data cannot tell apart, as a JSON list (the README shows one); report.json
     /// lists what is open, with the poses to choose from
     #[arg(long, value_name = "FILE")]
@@ -80,6 +83,11 @@ fn unit(text: &str) -> Result<f64, String> {
         .ok_or_else(|| "must be mm, cm, m, km, in, ft, us-ft, or metres in one unit".to_owned())
 }
 
+/// Three numbers with commas.
+pub(super) fn upward(text: &str) -> Result<[f64; 3], String> {
+    three_numbers(text).ok_or_else(|| "must be three numbers: x,y,z".to_owned())
+}
+
 /// Registers, writes the results, and says how it went by the exit code.
 ///
 /// # Errors
@@ -88,7 +96,7 @@ pub fn run(args: &RegisterArgs) -> anyhow::Result<ExitCode> {
     let started = Moment::now();
     let settings = ProjectSettings { seed: Seed(args.seed), resolution: args.resolution };
     settings.validate()?;
-    let interpretation = Interpretation { metres_per_unit: args.units, sensor_position: None };
+    let interpretation = Interpretation { metres_per_unit: args.units, sensor_position: None, up: args.up };
     interpretation.validate()?;
     let inputs = inputs::gather(&args.scans, Some(&args.out))?;
     let decisions = match &args.decisions {

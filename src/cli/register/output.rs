@@ -190,7 +190,7 @@ fn place(registration: &Registration, key: ScanKey) -> Option<Pose> {
 
 /// Where the sensor stood in the scan's own frame: as the file says, or the origin if the points bear it out.
 fn sensor(registration: &Registration, key: ScanKey, source: &Source) -> Option<[f64; 3]> {
-    if let SensorPosition::Known(position) = source.sensor(&registration.interpretation) {
+    if let SensorPosition::Known(position) = source.stance(&registration.interpretation).position {
         return Some(position);
     }
     let prepared = &registration.model.graph().scan(key)?.prepared;

@@ -134,7 +134,7 @@ pub(in crate::cli) fn prepare_all(
     let one = |(key, scan): (&ScanKey, &DistinctScan)| -> Result<PreparedScan, Refusal> {
         let source = Source::read_again(&scan.path, *key, interpretation, control.cancel)?;
         let prepared =
-            prepare(*key, &source.decoded.cloud, source.sensor(interpretation), options, counter.quiet());
+            prepare(*key, &source.decoded.cloud, source.stance(interpretation), options, counter.quiet());
         counter.one_more();
         Ok(prepared?)
     };

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::cloud::{DecodeError, DecodeOptions, Decoded, ScanKey, decode};
 use crate::control::{CancelToken, Cancelled};
-use crate::features::{PrepareError, SensorPosition};
+use crate::features::{PrepareError, SensorPosition, Stance};
 use crate::project::Interpretation;
 
 /// Why a scan takes no part, in the words of the service.
@@ -101,10 +101,11 @@ impl Source {
         }
     }
 
-    /// Where the sensor stood: as the command line or the file says.
-    pub fn sensor(&self, interpretation: &Interpretation) -> SensorPosition {
+    /// How the sensor stood: as the command line or the file says.
+    pub fn stance(&self, interpretation: &Interpretation) -> Stance {
         let said = interpretation.sensor_position.or(self.decoded.sensor_position);
-        said.map_or(SensorPosition::Assumed, SensorPosition::Known)
+        let position = said.map_or(SensorPosition::Assumed, SensorPosition::Known);
+        Stance { position, up: interpretation.up }
     }
 }
 

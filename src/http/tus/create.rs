@@ -24,7 +24,7 @@ use crate::storage::Seal;
 #[utoipa::path(post, path = "/v1/uploads", tag = "uploads", params(
     ("tus-resumable" = String, Header, description = "1.0.0", pattern = "^1\\.0\\.0$"),
     ("upload-length" = u64, Header, description = "Bytes that will come", minimum = 1),
-    ("upload-metadata" = String, Header, description = "Pairs of a key and its value in base64, separated by commas: project, name (or filename), units, sensor_position"),
+    ("upload-metadata" = String, Header, description = "Pairs of a key and its value in base64, separated by commas: project, name (or filename), units, sensor_position, up"),
     ("upload-checksum" = Option<String>, Header, description = "sha1, sha256 or sha512, a space, and the base64 of what the bytes of this request hash to"),
     ("content-digest" = Option<String>, Header, description = "RFC 9530: sha-256 or sha-512 of the bytes of this request")),
     request_body(content = Option<Bytes>, content_type = "application/offset+octet-stream", description = "The first bytes, if any"),

@@ -23,7 +23,7 @@ pub struct Metadata {
     pub project: ProjectId,
     /// `name`, or `filename` if that is not given: what the scan is called.
     pub name: Name,
-    /// `units` and `sensor_position`: how the bytes are read.
+    /// `units`, `sensor_position` and `up`: how the bytes are read.
     pub interpretation: Interpretation,
 }
 
@@ -87,11 +87,17 @@ mod tests {
         let metadata = parse_metadata(&text).unwrap();
         assert_eq!(metadata.name.as_str(), "Büro.ply");
         assert_eq!(metadata.interpretation.metres_per_unit, 0.001);
-        let both =
-            encoded(&[PROJECT, ("filename", "a.ply"), ("name", "b.ply"), ("sensor_position", "1,2,3")]);
+        let both = encoded(&[
+            PROJECT,
+            ("filename", "a.ply"),
+            ("name", "b.ply"),
+            ("sensor_position", "1,2,3"),
+            ("up", "0,0,1"),
+        ]);
         let metadata = parse_metadata(&both).unwrap();
         assert_eq!(metadata.name.as_str(), "b.ply");
         assert_eq!(metadata.interpretation.sensor_position, Some([1.0, 2.0, 3.0]));
+        assert_eq!(metadata.interpretation.up, Some([0.0, 0.0, 1.0]));
     }
 
     #[test]
