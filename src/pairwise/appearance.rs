@@ -134,7 +134,7 @@ mod tests {
     #[test]
     fn chance_gives_more_where_few_colours_meet() {
         let halves = room(1, |turn| [if turn < std::f32::consts::PI { 40 } else { 200 }; 3]);
-        let stripes = room(2, |turn| [if (turn * 8.0) as u32 % 2 == 0 { 40 } else { 200 }; 3]);
+        let stripes = room(2, |turn| [if ((turn * 8.0) as u32).is_multiple_of(2) { 40 } else { 200 }; 3]);
         let by_chance = |scan| appearance(scan, scan, &turned(0.0)).expect("colours differ").by_chance;
         assert!(
             by_chance(&stripes) < 0.5 * by_chance(&halves),
