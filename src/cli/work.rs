@@ -11,7 +11,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
 use crate::config::Settings;
-use crate::jobs::{Compute, NICENESS, NOT_NOW, Order, Report, work_for_service, yield_to_clients};
+use crate::jobs::{Compute, NOT_NOW, Order, Report, work_for_service, yield_to_clients};
 use crate::storage::Store;
 use crate::telemetry;
 
@@ -82,14 +82,11 @@ pub fn run(args: &WorkArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// Makes this process a session of its own. Where autogroups are on, Linux shares the processor out by sessions first: in that of the
-/// service, what is computed here would be taken from what the service may use to answer its clients. Niceness counts within a session;
-/// beside others this one is as nice by itself.
+/// service, what is computed here would be taken from what the service may use to answer its clients. The session itself is no nicer than
+/// others: beside other busy programs it would get next to nothing, also while it holds the database's write lock.
 fn stand_apart() {
-    // It is refused to whoever leads a group of processes, such as one that a person started: that one shares its session with others.
-    if setsid().is_ok() {
-        // Not told everywhere.
-        let _ = std::fs::write("/proc/self/autogroup", NICENESS.to_string());
-    }
+    // It is refused to whoever leads a group of processes, such as one that a person started.
+    let _ = setsid();
 }
 
 /// A computation that needs more than its memory fails here, and not the service or its neighbours; and nobody wants that memory on disk.

@@ -48,7 +48,7 @@ pub use intake::{Intake, IntakeError, IntakeLimits, UploadRequest};
 pub use isolated::{Isolated, Isolation, NOT_NOW, Order, Report, work_for_service};
 pub(crate) use pace::Pace;
 pub use parameters::DECIDING_SCANS;
-pub use precedence::{NICENESS, answer_promptly, yield_to_clients};
+pub use precedence::{answer_promptly, yield_to_clients};
 pub use reason::{reason_of, reason_of_refusal};
 pub use resumable::{Continuation, Resumable, ResumableError};
 pub use workers::{WorkerOptions, Workers};

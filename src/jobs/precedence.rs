@@ -17,7 +17,7 @@ const SHORT_NS: u64 = 100_000;
 const USUAL_NS: u64 = 0;
 
 /// How much nicer those are that compute.
-pub const NICENESS: i32 = 10;
+const NICENESS: i32 = 10;
 
 /// Lets this thread, and those that it starts from now on, answer as soon as something comes.
 pub fn answer_promptly() {
