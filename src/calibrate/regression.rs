@@ -152,14 +152,28 @@ mod tests {
 
     #[test]
     fn what_is_known_already_is_not_learned_again() {
-        let mut examples = disc(|_| 1.0);
-        let alone = fit(&examples).expect("both labels");
-        for example in &mut examples {
-            example.offset = alone.logit(&example.features);
-        }
-        let more = fit(&examples).expect("both labels");
-        let most = |of: &Logistic| examples.iter().map(|e| of.logit(&e.features).abs()).fold(0.0, f64::max);
-        assert!(most(&more) < 0.2 * most(&alone), "{} {}", most(&more), most(&alone));
+        // Right with the probability that log-odds of 2 x + 0.5 give, of which the offset knows all or nothing.
+        let examples = |known: bool| -> Vec<Example> {
+            let at = |i: i32| {
+                let x = f64::from(i) / 100.0;
+                let logit = 2.0 * x + 0.5;
+                let p = 1.0 / (1.0 + (-logit).exp());
+                let example = move |right, weight| Example {
+                    features: vec![x],
+                    offset: if known { logit } else { 0.0 },
+                    right,
+                    weight,
+                };
+                [example(true, 2.0 * p), example(false, 2.0 * (1.0 - p))]
+            };
+            (-150..150).flat_map(at).collect()
+        };
+        let learned = |known| {
+            let of = fit(&examples(known)).expect("both labels");
+            of.logit(&[1.0]) - of.logit(&[-1.0])
+        };
+        assert!((3.0..4.5).contains(&learned(false)), "{}", learned(false));
+        assert!(learned(true).abs() < 1e-6, "{}", learned(true));
     }
 
     #[test]
