@@ -151,7 +151,6 @@ impl<P> Drop for AtWork<'_, P> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Settings;
 
     const SHARE: u64 = 1 << 30;
 
@@ -180,9 +179,20 @@ mod tests {
     }
 
     fn options(workers: usize) -> WorkerOptions {
-        let given =
-            Settings { workers: Some(workers), worker_memory_bytes: Some(SHARE), ..Settings::default() };
-        given.resolve().unwrap().workers
+        let whatever = Duration::from_secs(60);
+        WorkerOptions {
+            workers,
+            lease: whatever,
+            poll: whatever,
+            progress_every: whatever,
+            batch: 1,
+            max_points: 1,
+            memory_bytes: SHARE,
+            job_limit: whatever,
+            isolated: None,
+            collect_every: whatever,
+            grace: whatever,
+        }
     }
 
     fn mapper(name: u32, memory: u64) -> Fake {
