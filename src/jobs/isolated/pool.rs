@@ -179,7 +179,7 @@ mod tests {
     }
 
     fn options(workers: usize) -> WorkerOptions {
-        let whatever = Duration::from_secs(60);
+        let whatever = Duration::from_mins(1);
         WorkerOptions {
             workers,
             lease: whatever,
