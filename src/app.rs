@@ -129,13 +129,14 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         stop: stop.clone(),
         openapi: Arc::from(openapi_yaml().map_err(|problem| StartError::Description(problem.detail))?),
     };
-    let workers = Workers::start(store.clone(), compute, config.workers, demand)
+    let workers = Workers::start(store.clone(), compute, config.workers, Arc::clone(&demand))
         .await
         .map_err(|error| StartError::Data(config.data.clone(), error))?;
     tracing::info!(%addr, data = %config.data.display(), "listening");
     let courier = Courier::new(store.clone(), config.webhooks)?;
     let scheme = if tls.is_some() { "https" } else { "http" };
-    let entrance = Entrance { listener, limits: config.connections, proxies: config.proxies, tls, metrics };
+    let entrance =
+        Entrance { listener, limits: config.connections, proxies: config.proxies, tls, metrics, demand };
     let server = tokio::spawn(serve(entrance, api, workers, courier, store, stop.clone()));
     Ok(Running { addr, scheme, stop, server })
 }

@@ -82,7 +82,7 @@ pub struct Settings {
     /// Requests a second from one address, ten seconds' worth of them at once; more are refused with 429, 0 is no limit [default: 200]
     #[arg(long, env = "CAIRN_REQUESTS_PER_SECOND", value_name = "N")]
     pub requests_per_second: Option<u64>,
-    /// Requests a second, of all together, from which on jobs leave one core to answers; 0: never [default: 20]
+    /// Requests a second from which on jobs leave one core to answers, if they come over at least eight connections; 0: never [default: 20]
     #[arg(long, env = "CAIRN_SPARE_CORE_AT", value_name = "N")]
     pub spare_core_at: Option<u64>,
     /// Requests a minute from one address with keys that open nothing; more are refused with 429, 0 is no limit [default: 30]

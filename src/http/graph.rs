@@ -1,17 +1,18 @@
 //! `/v1/projects/{p}/graph`: which scans hold which in place.
 
-use axum::Json;
 use axum::extract::State;
+use axum::response::Response;
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::aside;
 use super::extract::Ids;
 use super::model::{ComponentBody, components};
 use super::open_join::{Names, OpenJoinBody, UndoneBody};
 use super::problem::{Problem, Problems};
 use super::query::Params;
 use super::router::Api;
-use crate::project::{Edge, ProjectId, ScanId, ScanState, Standing, VersionNumber};
+use crate::project::{Edge, ModelContent, ProjectId, ScanId, ScanState, Standing, VersionNumber};
 
 /// A scan in the graph.
 #[derive(Debug, Serialize, ToSchema)]
@@ -72,28 +73,34 @@ pub(super) async fn get_graph(
     State(api): State<Api>,
     Ids(project): Ids<ProjectId>,
     mut query: Params,
-) -> Result<Json<GraphBody>, Problem> {
+) -> Result<Response, Problem> {
     let version = query.version()?;
     query.finish()?;
     let (version, content) = api.store.content(project, version).await?;
-    let node = |(scan, standing): &(ScanId, Standing)| {
-        let (state, place) = match standing {
-            Standing::Registered(p) => (ScanState::Registered, Some(p)),
-            Standing::Waiting(_) => (ScanState::Waiting, None),
-            Standing::Failed(_) => (ScanState::Failed, None),
-        };
-        let neighbours = place.map_or(0, |p| p.neighbours);
-        NodeBody { scan: *scan, state, component: place.map(|p| p.component), neighbours }
-    };
-    let edge = |e: &Edge| EdgeBody { a: e.a, b: e.b, inliers: e.inliers, overlap: e.overlap, score: e.score };
-    let edges = content.edges.iter();
     let names = Names::needed(&api.store, project, &content).await?;
-    Ok(Json(GraphBody {
-        version,
-        nodes: content.scans.iter().map(node).collect(),
-        edges: edges.map(edge).collect(),
-        open_joins: names.open_joins(&content.open_joins),
-        undone: names.undone(&content.undone),
-        components: components(content.components),
-    }))
+    aside::json(move || GraphBody::new(version, content, &names)).await
+}
+
+impl GraphBody {
+    fn new(version: VersionNumber, content: ModelContent, names: &Names) -> Self {
+        let node = |(scan, standing): &(ScanId, Standing)| {
+            let (state, place) = match standing {
+                Standing::Registered(p) => (ScanState::Registered, Some(p)),
+                Standing::Waiting(_) => (ScanState::Waiting, None),
+                Standing::Failed(_) => (ScanState::Failed, None),
+            };
+            let neighbours = place.map_or(0, |p| p.neighbours);
+            NodeBody { scan: *scan, state, component: place.map(|p| p.component), neighbours }
+        };
+        let edge =
+            |e: &Edge| EdgeBody { a: e.a, b: e.b, inliers: e.inliers, overlap: e.overlap, score: e.score };
+        Self {
+            version,
+            nodes: content.scans.iter().map(node).collect(),
+            edges: content.edges.iter().map(edge).collect(),
+            open_joins: names.open_joins(&content.open_joins),
+            undone: names.undone(&content.undone),
+            components: components(content.components),
+        }
+    }
 }

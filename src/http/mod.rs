@@ -4,6 +4,7 @@
 //! answer; every error is problem+json ([`Problem`]).
 
 mod access;
+mod aside;
 mod cloud;
 mod content_digest;
 mod decision;

@@ -8,6 +8,7 @@ use serde::Serialize;
 use serde_json::Value;
 use utoipa::ToSchema;
 
+use super::aside;
 use super::download::none_match;
 use super::extract::Ids;
 use super::link::Link;
@@ -182,7 +183,7 @@ pub(super) async fn get_model(
         StatusCode::NOT_MODIFIED.into_response()
     } else {
         let names = Names::needed(&api.store, project, &content).await?;
-        Json(ModelBody::new(project, version, content, &names)).into_response()
+        aside::json(move || ModelBody::new(project, version, content, &names)).await?
     };
     response.headers_mut().insert(header::ETAG, HeaderValue::from_str(&tag).map_err(Problem::internal)?);
     Ok(response)
@@ -216,8 +217,8 @@ pub(super) async fn list_versions(
 pub(super) async fn get_version(
     State(api): State<Api>,
     Ids((project, version)): Ids<(ProjectId, u32)>,
-) -> Result<Json<ModelBody>, Problem> {
+) -> Result<Response, Problem> {
     let (version, content) = api.store.content(project, Some(VersionNumber(version))).await?;
     let names = Names::needed(&api.store, project, &content).await?;
-    Ok(Json(ModelBody::new(project, version, content, &names)))
+    aside::json(move || ModelBody::new(project, version, content, &names)).await
 }

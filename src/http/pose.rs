@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write as _;
 use std::io;
 
-use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::{HeaderName, header};
@@ -15,14 +14,14 @@ use serde::Serialize;
 use tokio::sync::mpsc;
 use utoipa::ToSchema;
 
+use super::aside::aside;
 use super::extract::Ids;
 use super::problem::{Problem, Problems};
 use super::query::Params;
 use super::router::Api;
 use crate::geometry::Pose;
 use crate::geometry::pose_text::{LogEntry, to_kitti, to_log, to_tum};
-use crate::project::{ModelContent, ProjectId, ScanId, Standing, VersionNumber};
-use crate::storage::Store;
+use crate::project::{ModelContent, Name, ProjectId, ScanId, Standing, VersionNumber};
 
 /// A scan's pose.
 #[derive(Debug, Serialize, ToSchema)]
@@ -98,7 +97,19 @@ pub(super) async fn get_poses(
     let component = query.value("component", "the index of a component")?;
     query.finish()?;
     let (version, content) = api.store.content(project, version).await?;
-    let scans = named(&api.store, project, &content, component).await?;
+    let names = api.store.names_ever(project).await?;
+    aside(move || poses(form, version, &content, component, names)).await?
+}
+
+/// The answer with the poses of a version.
+fn poses(
+    form: Form,
+    version: VersionNumber,
+    content: &ModelContent,
+    component: Option<usize>,
+    names: Vec<(ScanId, Name)>,
+) -> Result<Response, Problem> {
+    let scans = named(content, component, names);
     let of = |component: usize| {
         scans.iter().filter_map(move |s| {
             let (c, pose) = s.place?;
@@ -108,8 +119,12 @@ pub(super) async fn get_poses(
     let text = match form {
         Form::Json => {
             let body = PosesBody { version, scans: bodies(scans) };
-            return Ok(([(HeaderName::from_static("cairn-version"), version.to_string())], Json(body))
-                .into_response());
+            let text = serde_json::to_vec(&body).map_err(Problem::internal)?;
+            let headers = [
+                (header::CONTENT_TYPE, "application/json".to_owned()),
+                (HeaderName::from_static("cairn-version"), version.to_string()),
+            ];
+            return Ok((headers, text).into_response());
         }
         Form::Tum => Body::from(to_tum(of(component.unwrap_or(0)))),
         Form::Kitti => Body::from(to_kitti(of(component.unwrap_or(0)).map(|(_, pose)| pose))),
@@ -123,25 +138,20 @@ pub(super) async fn get_poses(
 }
 
 /// The scans of a version in the natural order of their names.
-async fn named(
-    store: &Store,
-    project: ProjectId,
-    content: &ModelContent,
-    component: Option<usize>,
-) -> Result<Vec<Named>, Problem> {
+fn named(content: &ModelContent, component: Option<usize>, names: Vec<(ScanId, Name)>) -> Vec<Named> {
     let standings: HashMap<ScanId, &Standing> = content.scans.iter().map(|(id, s)| (*id, s)).collect();
     let mut scans = Vec::new();
-    for (scan, _) in store.scans_ever(project).await? {
-        let place = match standings.get(&scan.id) {
+    for (scan, name) in names {
+        let place = match standings.get(&scan) {
             None => continue,
             Some(Standing::Registered(p)) => Some((p.component, p.model_from_scan)),
             Some(_) => None,
         };
         let place = place.filter(|(c, _)| component.is_none_or(|wanted| wanted == *c));
-        scans.push(Named { scan: scan.id, name: scan.name.to_string(), place });
+        scans.push(Named { scan, name: name.to_string(), place });
     }
     scans.sort_by_cached_key(|s| (natural(&s.name), s.scan));
-    Ok(scans)
+    scans
 }
 
 fn bodies(scans: Vec<Named>) -> BTreeMap<String, PoseBody> {

@@ -1,14 +1,17 @@
-//! How much is asked of the service at this moment: `http` tells of every request, and `isolated` leaves a core to their answers while
-//! there are many.
+//! How much is asked of the service at this moment: `http` tells of every request and of every connection, and `isolated` leaves a core to
+//! answers while many ask much.
 
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// The time over which requests are counted.
 const WINDOW: Duration = Duration::from_secs(1);
 /// How long after much was asked it is taken that much will be.
 const LASTS: Duration = Duration::from_secs(5);
+/// Connections at once that many clients have. Fewer that ask as often are loops that wait for their jobs: to have those done sooner serves
+/// them better than an answer that says sooner that they are not.
+const CROWD: usize = 8;
 
 /// Requests, and whether there are many.
 #[derive(Debug)]
@@ -16,6 +19,7 @@ pub struct Demand {
     /// Requests a second that are many; 0: no number is.
     many: u64,
     asked: AtomicU64,
+    connected: AtomicUsize,
     state: Mutex<State>,
 }
 
@@ -34,7 +38,7 @@ impl Demand {
     pub fn new(many: u64) -> Self {
         let now = Instant::now();
         let state = Mutex::new(State { window: now, before: 0, until: now });
-        Self { many, asked: AtomicU64::new(0), state }
+        Self { many, asked: AtomicU64::new(0), connected: AtomicUsize::new(0), state }
     }
 
     /// Counts a request.
@@ -42,7 +46,14 @@ impl Demand {
         self.asked.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Whether many requests came lately.
+    /// Counts a connection until what is returned is dropped.
+    #[must_use]
+    pub fn connected(self: &Arc<Self>) -> Connected {
+        self.connected.fetch_add(1, Ordering::Relaxed);
+        Connected(Arc::clone(self))
+    }
+
+    /// Whether many requests came lately, from many clients.
     pub(super) fn is_high(&self, now: Instant) -> bool {
         if self.many == 0 {
             return false;
@@ -51,7 +62,8 @@ impl Demand {
         let passed = now.saturating_duration_since(state.window);
         if passed >= WINDOW {
             let asked = self.asked.load(Ordering::Relaxed);
-            if (asked - state.before) as f64 >= self.many as f64 * passed.as_secs_f64() {
+            let often = (asked - state.before) as f64 >= self.many as f64 * passed.as_secs_f64();
+            if often && self.connected.load(Ordering::Relaxed) >= CROWD {
                 state.until = now + LASTS;
             }
             (state.window, state.before) = (now, asked);
@@ -60,13 +72,29 @@ impl Demand {
     }
 }
 
+/// A connection of a client.
+#[derive(Debug)]
+pub struct Connected(Arc<Demand>);
+
+impl Drop for Connected {
+    fn drop(&mut self) {
+        self.0.connected.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn crowd(many: u64) -> (Arc<Demand>, Vec<Connected>) {
+        let demand = Arc::new(Demand::new(many));
+        let crowd = (0..CROWD).map(|_| demand.connected()).collect();
+        (demand, crowd)
+    }
+
     #[test]
     fn demand_is_high_while_many_ask_and_a_little_longer() {
-        let demand = Demand::new(3);
+        let (demand, _crowd) = crowd(3);
         let mut now = Instant::now();
         let mut second = |requests: usize| {
             (0..requests).for_each(|_| demand.asked());
@@ -80,8 +108,24 @@ mod tests {
     }
 
     #[test]
+    fn a_few_that_ask_often_are_no_crowd() {
+        let (demand, mut crowd) = crowd(3);
+        let mut now = Instant::now();
+        let mut second = || {
+            (0..1000).for_each(|_| demand.asked());
+            now += LASTS;
+            demand.is_high(now)
+        };
+        assert!(second());
+        crowd.pop();
+        assert!(!second());
+        crowd.push(demand.connected());
+        assert!(second());
+    }
+
+    #[test]
     fn nobody_looks_for_long_and_a_few_requests_since_are_not_many() {
-        let demand = Demand::new(3);
+        let (demand, _crowd) = crowd(3);
         let now = Instant::now();
         (0..20).for_each(|_| demand.asked());
         assert!(!demand.is_high(now + 10 * WINDOW));
@@ -89,7 +133,7 @@ mod tests {
 
     #[test]
     fn no_number_is_many_if_none_is_said_to_be() {
-        let demand = Demand::new(0);
+        let (demand, _crowd) = crowd(0);
         (0..1000).for_each(|_| demand.asked());
         assert!(!demand.is_high(Instant::now() + WINDOW));
     }

@@ -40,7 +40,7 @@ mod workers;
 pub use crate::cloud::metres_per_unit;
 pub use audit::undecodable;
 pub use compute::{Compute, Panicked};
-pub use demand::Demand;
+pub use demand::{Connected, Demand};
 pub use digest::{DigestAlgorithm, DigestMismatch, ExpectedDigest};
 pub use error::JobError;
 pub use exports::{CloudRequest, ComponentChoice, ExportError, Exports};

@@ -134,6 +134,15 @@ impl Store {
             .collect()
     }
 
+    /// Names of all scans of a project, deleted ones included, in order of arrival.
+    pub async fn names_ever(&self, project: ProjectId) -> Result<Vec<(ScanId, Name)>, StorageError> {
+        let rows = sqlx::query("SELECT id, name FROM scans WHERE project_id = ? ORDER BY arrival")
+            .bind(project.to_string())
+            .fetch_all(&self.read)
+            .await?;
+        rows.iter().map(|row| Ok((parsed(row, "id")?, name(row)?))).collect()
+    }
+
     /// Where the scans of the newest version stand, as far as their own rows tell; scans that were deleted are left out. For when
     /// the version itself cannot be read.
     pub async fn standings(&self, project: ProjectId) -> Result<Vec<(ScanId, Standing)>, StorageError> {
@@ -260,12 +269,16 @@ pub(super) fn content_key(row: &SqliteRow, column: &'static str) -> Result<Conte
     }
 }
 
+fn name(row: &SqliteRow) -> Result<Name, StorageError> {
+    word(row, "name", |text| Name::parse(text).ok())
+}
+
 fn scan(row: &SqliteRow) -> Result<Scan, StorageError> {
     Ok(Scan {
         id: parsed(row, "id")?,
         project: parsed(row, "project_id")?,
         key: content_key(row, "content_key")?,
-        name: word(row, "name", |text| Name::parse(text).ok())?,
+        name: name(row)?,
         format: row.try_get("format")?,
         blob: row.try_get("blob")?,
         bytes: count(row, "bytes")?,

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::net::TcpStream;
 use std::path::Path;
 
 use crate::process::{Faults, Process, room, until};
@@ -54,12 +55,15 @@ async fn a_process_at_work_leaves_a_core_to_answers_while_many_are_asked_for() {
     let all = cores(service.id());
     let few = at_work.iter().map(|worker| (*worker, (all - 1).max(1))).collect::<Vec<_>>();
     let now = || at_work.iter().map(|worker| (*worker, cores(*worker))).collect::<Vec<_>>();
+    let address = service.url.trim_start_matches("http://").to_owned();
+    let crowd = (0..16).map(|_| TcpStream::connect(&address).unwrap()).collect::<Vec<_>>();
     let mut asked = 0;
     while now() != few {
         service.json(&project).await;
         asked += 1;
         assert!(asked < 20_000, "{:?} of {all}", now());
     }
+    drop(crowd);
     until("it has all of them again when nobody asks", || now().iter().all(|(_, cores)| *cores == all)).await;
 }
 

@@ -29,6 +29,7 @@ use tower::ServiceExt as _;
 
 use super::Metrics;
 use super::access::{Peer, Proxies, Source};
+use crate::jobs::Demand;
 use patient::Patient;
 use places::Places;
 pub use tls::{Certificates, TlsError};
@@ -62,11 +63,13 @@ pub struct Entrance {
     pub tls: Option<Certificates>,
     /// Where those are counted that are turned away.
     pub metrics: Arc<Metrics>,
+    /// Where those are counted that are let in.
+    pub demand: Arc<Demand>,
 }
 
 /// Serves until `stop` is cancelled and the answers that were begun have ended.
 pub async fn serve(entrance: Entrance, app: Router, stop: CancellationToken) {
-    let Entrance { listener, limits, proxies, tls, metrics } = entrance;
+    let Entrance { listener, limits, proxies, tls, metrics, demand } = entrance;
     let (slots, places) = (Arc::new(Semaphore::new(limits.most)), Places::default());
     let acceptor = tls.as_ref().map(Certificates::acceptor);
     let renewal = tls.map(|certificates| tokio::spawn(certificates.renew(stop.clone())));
@@ -96,11 +99,12 @@ pub async fn serve(entrance: Entrance, app: Router, stop: CancellationToken) {
             continue;
         };
         let (app, tls, watcher) = (app.clone(), acceptor.clone(), graceful.watcher());
+        let connected = demand.connected();
         tokio::spawn(async move {
             if let Err(error) = attend(stream, peer.ip(), app, limits, tls, watcher).await {
                 tracing::debug!(%peer, error, "a connection ended early");
             }
-            drop((slot, place));
+            drop((slot, place, connected));
         });
     }
     drop(listener);
