@@ -10,7 +10,9 @@ use cairn::features::{
     prepare,
 };
 use cairn::geometry::Pose;
-use cairn::mapping::{Decision, LiveModel, MappingOptions, ModelSnapshot, ScanOutcome};
+use cairn::mapping::{
+    Decision, LiveModel, MappingOptions, ModelSnapshot, Refusal, ScanOutcome, WaitingReason,
+};
 use cairn::pairwise::{match_pair, shipped_verifier};
 use cairn::simulate::{BuildingOptions, Layout, SurveyOptions, simulate};
 
@@ -93,6 +95,20 @@ fn what_a_client_decides_holds_until_it_is_taken_back() {
     let after = model.snapshot();
     assert!(error(&after, &truth, x, y).is_some_and(|(_, metres)| metres < 0.1));
     assert!(after.decisions.as_slice().is_empty());
+}
+
+#[test]
+fn a_decided_join_brings_nothing_together_that_a_client_forbade() {
+    let truth = survey(BuildingOptions { rooms: 1, ..BuildingOptions::default() }, 3, 3);
+    let mut model = registered(&truth);
+    let [x, y, z] = [0, 1, 2].map(|index| truth.scans[index].key);
+    let join = |a: ScanKey, b: ScanKey| Decision::join(a, b, &(truth.poses[&a].inverse() * truth.poses[&b]));
+    let decisions = [join(x, y), join(y, z), Decision::forbid(x, z, None)];
+    with_control(|control| model.decide(&decisions, control)).unwrap();
+    let snapshot = model.snapshot();
+    assert!(error(&snapshot, &truth, x, y).is_some_and(|(_, metres)| metres < 0.1));
+    assert_eq!(snapshot.scans[&z], ScanOutcome::Waiting(WaitingReason::Forbidden));
+    assert!(snapshot.open_joins.iter().any(|open| open.refusal == Refusal::Forbidden));
 }
 
 #[test]

@@ -32,7 +32,7 @@ pub(super) struct OpenJoinBody {
     scans_a: usize,
     /// Scans in the smaller piece.
     scans_b: usize,
-    /// Why it was not made: `reason`, a stable word (ambiguous, contradicted, violates-free-space, too-little-support), and the
+    /// Why it was not made: `reason`, a stable word (ambiguous, contradicted, violates-free-space, too-little-support, forbidden), and the
     /// numbers behind it.
     #[schema(value_type = Object)]
     refusal: Value,
@@ -84,8 +84,8 @@ impl Names {
         if content.open_joins.is_empty() && content.undone.is_empty() {
             return Ok(Self::default());
         }
-        let scans = store.scans_ever(project).await?;
-        Ok(Self(scans.into_iter().map(|(scan, _)| (scan.id, scan.name.to_string())).collect()))
+        let scans = store.names_ever(project).await?;
+        Ok(Self(scans.into_iter().map(|(scan, name)| (scan, name.to_string())).collect()))
     }
 
     fn of(&self, id: ScanId) -> NamedScan {

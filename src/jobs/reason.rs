@@ -35,6 +35,7 @@ pub fn reason_of_refusal(refusal: &Refusal) -> Reason {
         Refusal::Violation { found, allowed } => {
             ("violates-free-space", json!({ "violation": found, "allowed": allowed }))
         }
+        Refusal::Forbidden => ("forbidden", Value::Null),
     };
     let numbers = if let Value::Object(numbers) = numbers { numbers } else { Map::new() };
     Reason { reason: word.to_owned(), numbers }
@@ -67,6 +68,7 @@ mod tests {
                 Refusal::Violation { found: 0.3, allowed: 0.1 },
                 WaitingReason::ViolatesFreeSpace { violation: 0.3, allowed: 0.1 },
             ),
+            (Refusal::Forbidden, WaitingReason::Forbidden),
         ] {
             assert_eq!(reason_of_refusal(&refusal), reason_of(&reason));
         }

@@ -60,6 +60,9 @@ fn ordered(x: ScanKey, y: ScanKey, x_from_y: &Pose) -> Pose {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Decisions {
     list: Vec<Decision>,
+    /// What the mapper itself rules out while it grows: poses that it took back. Clients' joins stand against these.
+    #[serde(skip)]
+    taken_back: Vec<Decision>,
 }
 
 /// A decided join between two components.
@@ -91,15 +94,21 @@ impl Decisions {
             });
             list.push(*decision);
         }
-        Self { list }
+        Self { list, taken_back: Vec::new() }
     }
 
-    /// These decisions and more. A client's join stands against any of them.
+    /// These decisions, and bans of the mapper's own until it has grown.
     #[must_use]
-    pub fn with(&self, more: &[Decision]) -> Self {
-        let mut list: Vec<Decision> = more.to_vec();
-        list.extend_from_slice(&self.list);
-        Self::new(&list)
+    pub fn with_taken_back(mut self, bans: &[Decision]) -> Self {
+        self.taken_back.extend_from_slice(bans);
+        self
+    }
+
+    /// The same without any ban.
+    #[must_use]
+    pub fn without_bans(&self) -> Self {
+        let joins = self.list.iter().filter(|d| matches!(d.verdict, Verdict::Join { .. }));
+        Self { list: joins.copied().collect(), taken_back: Vec::new() }
     }
 
     /// The decisions that hold.
@@ -110,7 +119,9 @@ impl Decisions {
 
     /// Forgets what was decided about a scan.
     pub fn remove_scan(&mut self, scan: ScanKey) {
-        self.list.retain(|d| d.pair.a != scan && d.pair.b != scan);
+        let others = |d: &Decision| d.pair.a != scan && d.pair.b != scan;
+        self.list.retain(others);
+        self.taken_back.retain(others);
     }
 
     /// The first decided join between two components, if any.
@@ -131,10 +142,10 @@ impl Decisions {
     /// Whether anything is forbidden at all.
     #[must_use]
     pub fn forbid_any(&self) -> bool {
-        self.list.iter().any(|d| matches!(d.verdict, Verdict::Forbid { .. }))
+        self.list.iter().chain(&self.taken_back).any(|d| matches!(d.verdict, Verdict::Forbid { .. }))
     }
 
-    /// Whether a ban stands against `a_from_b` between two components.
+    /// Whether a ban stands against `a_from_b` between two components: a client's, or one of the mapper's own.
     #[must_use]
     pub fn forbids(
         &self,
@@ -144,30 +155,24 @@ impl Decisions {
         a_from_b: &Pose,
         options: &MappingOptions,
     ) -> bool {
-        self.list.iter().any(|decision| {
-            let Verdict::Forbid { a_from_b: banned } = decision.verdict else { return false };
-            let PairKey { a: first, b: second } = decision.pair;
-            let across = |x: ScanKey, y: ScanKey| Some((*a.poses.get(&x)?, *b.poses.get(&y)?));
-            let between = match (across(first, second), across(second, first)) {
-                (Some((a_from_first, b_from_second)), _) => {
-                    a_from_first.inverse() * *a_from_b * b_from_second
-                }
-                (None, Some((a_from_second, b_from_first))) => {
-                    (a_from_second.inverse() * *a_from_b * b_from_first).inverse()
-                }
-                (None, None) => return false,
-            };
-            let Some(banned) = banned else { return true };
-            let (Some(banned), Some(moved)) = (local(graph, decision.pair, &banned), graph.scan(second))
-            else {
-                return false;
-            };
-            let (angle, distance) = centred_difference(&banned, &between, &moved.centroid);
-            angle < options.rival_angle && distance < options.rival_voxels * moved.prepared.resolution
-        })
+        let mut all = self.list.iter().chain(&self.taken_back);
+        all.any(|decision| rules_out(decision, graph, (a, b), a_from_b, options))
     }
 
-    /// Whether anything was decided about a pair.
+    /// Whether a client's ban does.
+    #[must_use]
+    pub fn client_forbids(
+        &self,
+        graph: &ScanGraph,
+        a: &Component,
+        b: &Component,
+        a_from_b: &Pose,
+        options: &MappingOptions,
+    ) -> bool {
+        self.list.iter().any(|decision| rules_out(decision, graph, (a, b), a_from_b, options))
+    }
+
+    /// Whether a client decided anything about a pair.
     #[must_use]
     pub fn concern(&self, pair: PairKey) -> bool {
         self.list.iter().any(|d| d.pair == pair)
@@ -177,6 +182,32 @@ impl Decisions {
     pub fn joined_pairs(&self) -> impl Iterator<Item = PairKey> + '_ {
         self.list.iter().filter(|d| matches!(d.verdict, Verdict::Join { .. })).map(|d| d.pair)
     }
+}
+
+/// Whether a decision is a ban that stands against `a_from_b` between two components.
+fn rules_out(
+    decision: &Decision,
+    graph: &ScanGraph,
+    (a, b): (&Component, &Component),
+    a_from_b: &Pose,
+    options: &MappingOptions,
+) -> bool {
+    let Verdict::Forbid { a_from_b: banned } = decision.verdict else { return false };
+    let PairKey { a: first, b: second } = decision.pair;
+    let across = |x: ScanKey, y: ScanKey| Some((*a.poses.get(&x)?, *b.poses.get(&y)?));
+    let between = match (across(first, second), across(second, first)) {
+        (Some((a_from_first, b_from_second)), _) => a_from_first.inverse() * *a_from_b * b_from_second,
+        (None, Some((a_from_second, b_from_first))) => {
+            (a_from_second.inverse() * *a_from_b * b_from_first).inverse()
+        }
+        (None, None) => return false,
+    };
+    let Some(banned) = banned else { return true };
+    let (Some(banned), Some(moved)) = (local(graph, decision.pair, &banned), graph.scan(second)) else {
+        return false;
+    };
+    let (angle, distance) = centred_difference(&banned, &between, &moved.centroid);
+    angle < options.rival_angle && distance < options.rival_voxels * moved.prepared.resolution
 }
 
 /// A motion between the own frames of two scans as one between the local frames of their prepared forms.

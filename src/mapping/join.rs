@@ -54,6 +54,8 @@ pub enum Refusal {
         /// What the level allows.
         allowed: f64,
     },
+    /// A client decided the join, and forbade what it would bring together.
+    Forbidden,
 }
 
 /// A candidate after alignment.
@@ -184,6 +186,9 @@ fn place(
         let aligned = align(graph, a, b, &pooled_fit(graph, a, b, candidate, voxel), voxel);
         let agrees = candidate.members.iter().all(|m| near(&aligned, m, voxel, options));
         let a_from_b = if agrees { aligned } else { candidate.a_from_b };
+        if options.decisions.client_forbids(graph, a, b, &a_from_b, options) {
+            return Err(Refusal::Forbidden);
+        }
         return Ok(Placed { a_from_b, support: candidate.support, violation: 0.0 });
     }
     let mut best = settle(&pooled_fit(graph, a, b, candidate, voxel));

@@ -209,7 +209,7 @@ impl LiveModel {
             }
         }
         for key in self.mapper.waiting.keys() {
-            let reason = self.mapper.waiting_reason(*key, &self.graph, &self.options);
+            let reason = self.mapper.waiting_reason(*key, &self.graph, self.voxel(), &self.options);
             snapshot.scans.insert(*key, ScanOutcome::Waiting(reason));
         }
         snapshot

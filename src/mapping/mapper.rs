@@ -13,7 +13,6 @@ use super::next_scan::visible_landmarks;
 use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{Reach, dense, local_bundle_adjustment, neighborhood};
-use super::snapshot::WaitingReason;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::{Retrieval, ScanGraph};
@@ -366,36 +365,6 @@ impl Mapper {
         self.components.sort_by(|x, y| y.len().cmp(&x.len()).then(x.gauge.cmp(&y.gauge)));
     }
 
-    /// Why a scan waits, in words for its owner.
-    #[must_use]
-    pub fn waiting_reason(
-        &self,
-        scan: ScanKey,
-        graph: &ScanGraph,
-        options: &MappingOptions,
-    ) -> WaitingReason {
-        let needed = options.levels.last().map_or(0.0, |l| l.support);
-        let tried = graph.neighbors(scan).count();
-        if graph.scans().len() < 2 {
-            return WaitingReason::OnlyScan;
-        }
-        match self.waiting.get(&scan).copied().flatten() {
-            Some(Refusal::Rival { support, rival }) => {
-                WaitingReason::Ambiguous { best_support: support, rival_support: rival }
-            }
-            Some(Refusal::Violation { found, allowed }) => {
-                WaitingReason::ViolatesFreeSpace { violation: found, allowed }
-            }
-            Some(Refusal::Contradicted { against, agreeing }) => {
-                WaitingReason::Contradicted { against, agreeing }
-            }
-            Some(Refusal::Support { found, .. }) => {
-                WaitingReason::NoVerifiedPair { tried, best_support: found, needed }
-            }
-            None => WaitingReason::NoVerifiedPair { tried, best_support: 0.0, needed },
-        }
-    }
-
     fn larger_first(&self, i: usize, j: usize) -> (usize, usize) {
         if self.components[j].len() > self.components[i].len() { (j, i) } else { (i, j) }
     }
@@ -421,7 +390,10 @@ fn worse(known: Option<Refusal>, new: Refusal) -> Option<Refusal> {
     match (known, new) {
         (Some(Refusal::Support { found, .. }), Refusal::Support { found: now, .. }) if now < found => known,
         (Some(Refusal::Contradicted { .. }), _)
-        | (Some(Refusal::Violation { .. } | Refusal::Rival { .. }), Refusal::Support { .. }) => known,
+        | (
+            Some(Refusal::Violation { .. } | Refusal::Rival { .. } | Refusal::Forbidden),
+            Refusal::Support { .. },
+        ) => known,
         _ => Some(new),
     }
 }

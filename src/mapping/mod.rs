@@ -30,6 +30,7 @@ mod tracks;
 mod undecided;
 mod undo;
 mod voice;
+mod waiting_reason;
 
 pub use decision::{Decision, Decisions, Verdict};
 pub use join::Refusal;

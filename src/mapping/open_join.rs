@@ -132,7 +132,9 @@ pub fn open_joins(
             Some(Some(refusal @ Refusal::Contradicted { .. })) => Some(*refusal),
             _ => None,
         });
-        let refusal = known.unwrap_or(if best.support < last.support {
+        let refusal = known.unwrap_or(if best.decided {
+            Refusal::Forbidden
+        } else if best.support < last.support {
             Refusal::Support { found: best.support, needed: last.support }
         } else if best.margin(options) < last.support {
             Refusal::Rival { support: best.support, rival: best.rival }

@@ -39,7 +39,7 @@ pub fn grow(
         }
         if let Some(bans) = mapper.undo_contradicted(graph, voxel, &options, control)? {
             undone += 1;
-            options.decisions = options.decisions.with(&bans);
+            options.decisions = options.decisions.with_taken_back(&bans);
             if undone < MAX_UNDONE {
                 continue;
             }

@@ -48,6 +48,8 @@ pub enum WaitingReason {
         /// Largest share allowed.
         allowed: f64,
     },
+    /// There is support enough for a place, but a client's decision forbids it.
+    Forbidden,
 }
 
 /// Where a scan stands in a model.

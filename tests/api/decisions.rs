@@ -157,6 +157,9 @@ async fn a_decision_holds_for_later_scans_rebuilds_restarts_and_new_engines_unti
     assert_eq!(between(&server, &project, &a, &b).await, None);
     let model = server.json(&format!("{project}/model")).await;
     assert_eq!(model["decisions"], json!([ban["id"]]));
+    for scan in model["scans"].as_array().unwrap() {
+        assert_eq!(scan["outcome"], json!({ "status": "waiting", "reason": "forbidden" }));
+    }
 
     let mut server = server.restart().await;
     assert_eq!(server.json(&format!("{project}/decisions/{}", id(&ban))).await, ban);
