@@ -118,6 +118,7 @@ function because(why) {
     ambiguous: () => `ambiguous: support ${n(why.best_support)}, of another pose ${n(why.rival_support)}`,
     contradicted: () => `contradicted: ${why.against} pairs are sure of another pose, ${why.agreeing} were of this one`,
     "violates-free-space": () => `violates free space: ${n(100 * why.violation)} %, allowed ${n(100 * why.allowed)} %`,
+    "single-pair": () => `two pieces share one pair alone: support ${n(why.best_support)}`,
     forbidden: () => "forbidden by a decision",
     "too-little-support": () => `too little support: ${n(why.best_support)}, needed ${n(why.needed)}`,
   };
@@ -138,7 +139,7 @@ function openJoinRow(open, own, version) {
     post(`${own}/decisions`, { verdict, scan_a: open.scan_a.id, scan_b: open.scan_b.id, ...more });
   const piece = (scan, scans) => scans > 1 ? `${scan.name} (with ${scans - 1} more)` : scan.name;
   const poses = open.poses.map((pose, index) => element("p", {},
-    element("span", { class: "soft" }, `support ${pose.support.toFixed(1)} by ${pose.edges} edges, ${pose.inliers.toLocaleString("en")} inliers, ` +
+    element("span", { class: "soft" }, `support ${pose.support.toFixed(1)} by ${pose.edges} ${pose.edges === 1 ? "edge" : "edges"}, ${pose.inliers.toLocaleString("en")} inliers, ` +
       `${(100 * pose.violation).toFixed(1)} % in free space`),
     button("Join so", decide("join", { pose: index, version }))));
   return element("tr", {},

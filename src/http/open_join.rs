@@ -32,8 +32,8 @@ pub(super) struct OpenJoinBody {
     scans_a: usize,
     /// Scans in the smaller piece.
     scans_b: usize,
-    /// Why it was not made: `reason`, a stable word (ambiguous, contradicted, violates-free-space, too-little-support, forbidden), and the
-    /// numbers behind it.
+    /// Why it was not made: `reason`, a stable word (ambiguous, contradicted, violates-free-space, too-little-support, single-pair,
+    /// forbidden), and the numbers behind it.
     #[schema(value_type = Object)]
     refusal: Value,
     /// The poses that were weighed, the best first. A decision may name one by its index.

@@ -36,6 +36,7 @@ pub fn reason_of_refusal(refusal: &Refusal) -> Reason {
             ("violates-free-space", json!({ "violation": found, "allowed": allowed }))
         }
         Refusal::Forbidden => ("forbidden", Value::Null),
+        Refusal::SinglePair { support } => ("single-pair", json!({ "best_support": support })),
     };
     let numbers = if let Value::Object(numbers) = numbers { numbers } else { Map::new() };
     Reason { reason: word.to_owned(), numbers }

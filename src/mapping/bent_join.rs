@@ -3,6 +3,7 @@
 use super::candidates::{Candidate, support_of};
 use super::component::Component;
 use super::consistency::thrown;
+use super::gravity::Gravity;
 use super::join::{SINGLE_STARTS, ViolationLimit, pooled_fit, violation_of};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{Reach, dense, pose_graph};
@@ -47,10 +48,14 @@ pub fn bent_join(
     };
     let (x, y) = (part(a), part(b));
     let found = violation_of(&judge(graph, &x, &y, &Pose::identity()));
-    let limit = ViolationLimit::new(graph, (a, b), candidate.support, level, options);
+    let limit = ViolationLimit::new(graph, (a, b), level, options);
     let banned = options.decisions.forbids(graph, &x, &y, &Pose::identity(), options);
     let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
-    Ok((!banned && found <= LENIENCE * limit.share() && kept >= level.support).then_some(joined))
+    let several = options.asks_for_several(a.len(), b.len(), level);
+    let backed = kept.support >= level.support && (kept.edges > 1 || !several);
+    let tips_over = Gravity::between(graph, &x, &y).is_some_and(|gravity| !gravity.admits(&Pose::identity()));
+    let allowed = found <= LENIENCE * limit.share(candidate.support);
+    Ok((!banned && !tips_over && allowed && backed).then_some(joined))
 }
 
 /// Of the fit to all edges and the poses of single edges, the one that is most clear of free space. The fit lies where the adjustment

@@ -8,6 +8,7 @@ use nalgebra::Vector3;
 
 use super::component::Component;
 use super::decision::DecidedJoin;
+use super::gravity::Gravity;
 use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
@@ -129,6 +130,11 @@ pub fn candidates(
     if options.decisions.forbid_any() {
         proposals.retain(|p| !options.decisions.forbids(graph, a, b, &p.a_from_b, options));
     }
+    if !proposals.is_empty()
+        && let Some(gravity) = Gravity::between(graph, a, b)
+    {
+        proposals.retain(|p| gravity.admits(&p.a_from_b));
+    }
     let reach = options.cluster_voxels * voxel;
     let sums = |centre: usize| {
         members(&proposals, centre, options.cluster_angle, reach)
@@ -214,6 +220,15 @@ fn decided(join: &DecidedJoin, graph: &ScanGraph, b: &Component) -> Candidate {
     }
 }
 
+/// What edges between two components say for a pose that is already known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Backing {
+    /// Sum over edges of the evidence.
+    pub support: f64,
+    /// Edges that say something.
+    pub edges: usize,
+}
+
 /// The support that edges between two components give to a pose that is already known.
 #[must_use]
 pub fn support_of(
@@ -223,7 +238,7 @@ pub fn support_of(
     a_from_b: &Pose,
     voxel: f64,
     options: &MappingOptions,
-) -> f64 {
+) -> Backing {
     let mut proposals = proposals(graph, a, b);
     for p in &mut proposals {
         // The known pose stands in as the centre, seen from each proposal's own scan.
@@ -231,7 +246,12 @@ pub fn support_of(
             p.evidence = 0.0;
         }
     }
-    best_by_edge(proposals.iter()).map(|p| p.evidence).sum()
+    let mut backing = Backing { support: 0.0, edges: 0 };
+    for p in best_by_edge(proposals.iter()) {
+        backing.support += p.evidence;
+        backing.edges += usize::from(p.evidence > LEAST_WORD);
+    }
+    backing
 }
 
 /// One proposal an edge: those that agree with the centre, the strongest of each edge.

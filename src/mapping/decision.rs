@@ -172,10 +172,10 @@ impl Decisions {
         self.list.iter().any(|decision| rules_out(decision, graph, (a, b), a_from_b, options))
     }
 
-    /// Whether a client decided anything about a pair.
+    /// Whether anything was decided about a pair, by a client or by taking back what it led to.
     #[must_use]
     pub fn concern(&self, pair: PairKey) -> bool {
-        self.list.iter().any(|d| d.pair == pair)
+        self.list.iter().chain(&self.taken_back).any(|d| d.pair == pair)
     }
 
     /// Pairs of scans that a join holds together.

@@ -4,7 +4,9 @@ use super::candidates::{best_candidate, support_of};
 use super::component::Component;
 use super::mapper::Mapper;
 use super::options::MappingOptions;
+use super::tracks::Tracks;
 use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
 use crate::graph::ScanGraph;
 use crate::pairwise::centred_difference;
@@ -19,21 +21,35 @@ const FILTER_MARGIN: f64 = 2.0;
 impl Mapper {
     /// Filtering: takes out scans that have clearly more support at another pose than at their own. They wait, and may register
     /// again. Returns how many.
-    pub fn filter_scans(&mut self, graph: &ScanGraph, voxel: f64, options: &MappingOptions) -> usize {
+    pub fn filter_scans(
+        &mut self,
+        graph: &ScanGraph,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<usize, Cancelled> {
         let mut misplaced: Vec<ScanKey> = Vec::new();
         for component in self.components.iter().filter(|c| c.len() >= FILTER_FROM) {
+            // Poses are all that is asked of the rest.
+            let mut rest = Component {
+                gauge: component.gauge,
+                poses: component.poses.clone(),
+                tracks: Tracks::default(),
+            };
             for (scan, pose) in &component.poses {
+                control.check()?;
                 if self.filtered.get(scan).copied().unwrap_or(0) >= MAX_FILTERED {
                     continue;
                 }
                 let single = Component::single(*scan);
-                let mut rest = component.clone();
                 rest.poses.remove(scan);
-                let Some(best) = best_candidate(graph, &rest, &single, voxel, options) else { continue };
-                let own = support_of(graph, &rest, &single, pose, voxel, options);
-                if best.support > own + FILTER_MARGIN
-                    && differs(&best.a_from_b, pose, *scan, graph, voxel, options)
-                {
+                let best = best_candidate(graph, &rest, &single, voxel, options);
+                let own = support_of(graph, &rest, &single, pose, voxel, options).support;
+                rest.poses.insert(*scan, *pose);
+                if best.is_some_and(|best| {
+                    best.support > own + FILTER_MARGIN
+                        && differs(&best.a_from_b, pose, *scan, graph, voxel, options)
+                }) {
                     misplaced.push(*scan);
                 }
             }
@@ -46,7 +62,7 @@ impl Mapper {
             self.add_waiting(*scan);
         }
         self.dissolve_small();
-        misplaced.len()
+        Ok(misplaced.len())
     }
 }
 

@@ -7,8 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use nalgebra::Vector3;
 
-use super::candidates::{Candidate, near, support_of};
+use super::candidates::{Backing, Candidate, near, support_of};
 use super::component::Component;
+use super::gravity::Gravity;
 use super::options::{JoinLevel, MappingOptions};
 use super::surfaces::{align, judge, judge_inside};
 use crate::geometry::{Kernel, Pose, rigid_fit};
@@ -56,6 +57,11 @@ pub enum Refusal {
     },
     /// A client decided the join, and forbade what it would bring together.
     Forbidden,
+    /// Two pieces of several scans each share one pair alone.
+    SinglePair {
+        /// Its support.
+        support: f64,
+    },
 }
 
 /// A candidate after alignment.
@@ -64,8 +70,18 @@ struct Placed {
     a_from_b: Pose,
     /// Support of the edges at the aligned pose.
     support: f64,
+    /// Edges that say something for it.
+    edges: usize,
     /// Share of the judged points that lie in free space.
     violation: f64,
+}
+
+/// What a candidate must show once it is aligned.
+struct Needed<'l, 'm> {
+    support: f64,
+    edges: usize,
+    limit: &'l ViolationLimit<'m>,
+    gravity: Option<Gravity>,
 }
 
 /// The violation that a join may show: little more than the two sides show within themselves, so that clean data, where wrong joins of
@@ -73,41 +89,46 @@ struct Placed {
 /// violates a little; and never more than the level says. What was bent, or has grown since, is allowed some times as much by those who
 /// ask. What the sides show is only counted when that matters.
 pub struct ViolationLimit<'m> {
-    /// Always allowed.
-    least: f64,
-    full: OnceCell<f64>,
+    most: f64,
+    floor: f64,
+    firm_support: f64,
+    usual: OnceCell<f64>,
     count: Box<dyn Fn() -> f64 + 'm>,
 }
 
 impl<'m> ViolationLimit<'m> {
-    /// The limit for joining `a` and `b` with this support at this level.
+    /// The limit for joining `a` and `b` at this level.
     #[must_use]
     pub fn new(
         graph: &'m ScanGraph,
         (a, b): (&'m Component, &'m Component),
-        support: f64,
         level: &JoinLevel,
         options: &'m MappingOptions,
     ) -> Self {
-        let most = level.violation;
         let count = move || {
             let inside = judge_inside(graph, a).plus(&judge_inside(graph, b)).violation_share();
-            let usual = options.violation_contrast * inside + options.violation_floor;
-            most.min(usual * (support / options.firm_support).clamp(1.0, FIRM_LENIENCE))
+            options.violation_contrast * inside + options.violation_floor
         };
-        Self { least: most.min(options.violation_floor), full: OnceCell::new(), count: Box::new(count) }
+        Self {
+            most: level.violation,
+            floor: options.violation_floor,
+            firm_support: options.firm_support,
+            usual: OnceCell::new(),
+            count: Box::new(count),
+        }
     }
 
-    /// Whether a join may violate free space by this share.
+    /// Whether a join that has this support may violate free space by this share.
     #[must_use]
-    pub fn admits(&self, violation: f64) -> bool {
-        violation <= self.least || violation <= self.share()
+    pub fn admits(&self, violation: f64, support: f64) -> bool {
+        violation <= self.most.min(self.floor) || violation <= self.share(support)
     }
 
-    /// The largest share that is allowed.
+    /// The largest share that is allowed for this support.
     #[must_use]
-    pub fn share(&self) -> f64 {
-        *self.full.get_or_init(&self.count)
+    pub fn share(&self, support: f64) -> f64 {
+        let usual = *self.usual.get_or_init(&self.count);
+        self.most.min(usual * (support / self.firm_support).clamp(1.0, FIRM_LENIENCE))
     }
 }
 
@@ -124,16 +145,23 @@ pub fn weigh_join(
     options: &MappingOptions,
 ) -> Result<Pose, Refusal> {
     let mut first_refusal = None;
-    let support = candidates.first().map_or(0.0, |best| best.support);
-    let limit = ViolationLimit::new(graph, (a, b), support, level, options);
-    let place =
-        |candidate: &Candidate, least: f64| place(graph, (a, b), candidate, least, &limit, voxel, options);
+    let several = options.asks_for_several(a.len(), b.len(), level);
+    let limit = ViolationLimit::new(graph, (a, b), level, options);
+    let gravity = Gravity::between(graph, a, b);
+    let place = |candidate: &Candidate, least: f64, edges: usize| {
+        let needed = Needed { support: least, edges, limit: &limit, gravity };
+        place(graph, (a, b), candidate, &needed, voxel, options)
+    };
     for (rank, candidate) in candidates.iter().enumerate() {
         if candidate.support < level.support {
             let refusal = Refusal::Support { found: candidate.support, needed: level.support };
             return Err(first_refusal.unwrap_or(refusal));
         }
-        match place(candidate, level.support) {
+        if several && !candidate.rests_on_several() {
+            first_refusal = first_refusal.or(Some(Refusal::SinglePair { support: candidate.support }));
+            continue;
+        }
+        match place(candidate, level.support, if several { 2 } else { 1 }) {
             Ok(placed) => {
                 let margin = |rival: f64| placed.support - options.rival_share * rival;
                 // Rivals are looked at only as far as they matter.
@@ -141,7 +169,7 @@ pub fn weigh_join(
                     .iter()
                     .enumerate()
                     .filter(|(other, c)| *other != rank && margin(c.doubt) < level.support)
-                    .find(|(_, c)| place(c, 0.0).is_ok());
+                    .find(|(_, c)| place(c, 0.0, 0).is_ok());
                 return match rival {
                     Some((_, c)) => Err(Refusal::Rival { support: placed.support, rival: c.doubt }),
                     None => Ok(placed.a_from_b),
@@ -160,27 +188,28 @@ pub fn violation_of(counts: &Counts) -> f64 {
     if counts.wrong_normal_share() > MAX_WRONG_NORMAL { 1.0 } else { counts.violation_share() }
 }
 
-/// Aligns one candidate and checks that it keeps at least `least` support, no ban stands against it, and free space allows it. Where edges
+/// Aligns one candidate and checks that it keeps what is needed, no ban stands against it, and free space allows it. Where edges
 /// agree only roughly, the fit to all of them can slide into free space while one of them is right, so the poses of single edges are
 /// tried too.
 fn place(
     graph: &ScanGraph,
     (a, b): (&Component, &Component),
     candidate: &Candidate,
-    least: f64,
-    limit: &ViolationLimit<'_>,
+    needed: &Needed<'_, '_>,
     voxel: f64,
     options: &MappingOptions,
 ) -> Result<Placed, Refusal> {
     let settle = |start: &Pose| {
         let a_from_b = align(graph, a, b, start, voxel);
+        let tips_over = needed.gravity.is_some_and(|gravity| !gravity.admits(&a_from_b));
         // What alignment moved to a banned pose has no support there.
-        let support = if options.decisions.forbids(graph, a, b, &a_from_b, options) {
-            f64::NEG_INFINITY
-        } else {
-            support_of(graph, a, b, &a_from_b, voxel, options)
-        };
-        Placed { a_from_b, support, violation: violation_of(&judge(graph, a, b, &a_from_b)) }
+        let Backing { support, edges } =
+            if tips_over || options.decisions.forbids(graph, a, b, &a_from_b, options) {
+                Backing { support: f64::NEG_INFINITY, edges: 0 }
+            } else {
+                support_of(graph, a, b, &a_from_b, voxel, options)
+            };
+        Placed { a_from_b, support, edges, violation: violation_of(&judge(graph, a, b, &a_from_b)) }
     };
     if candidate.decided {
         let aligned = align(graph, a, b, &pooled_fit(graph, a, b, candidate, voxel), voxel);
@@ -189,27 +218,32 @@ fn place(
         if options.decisions.client_forbids(graph, a, b, &a_from_b, options) {
             return Err(Refusal::Forbidden);
         }
-        return Ok(Placed { a_from_b, support: candidate.support, violation: 0.0 });
+        return Ok(Placed { a_from_b, support: candidate.support, edges: 1, violation: 0.0 });
     }
+    let backed = |p: &Placed| p.support >= needed.support && p.edges >= needed.edges;
+    let allowed = |p: &Placed| needed.limit.admits(p.violation, p.support.min(candidate.support));
     let mut best = settle(&pooled_fit(graph, a, b, candidate, voxel));
-    let passes = |p: &Placed| p.support >= least && limit.admits(p.violation);
-    if !passes(&best) && candidate.members.len() > 1 {
+    if !(backed(&best) && allowed(&best)) && candidate.members.len() > 1 {
         for member in candidate.members.iter().take(SINGLE_STARTS) {
             let other = settle(&member.a_from_b);
-            if other.support >= least && (other.violation < best.violation || best.support < least) {
+            if backed(&other) && (other.violation < best.violation || !backed(&best)) {
                 best = other;
             }
-            if passes(&best) {
+            if backed(&best) && allowed(&best) {
                 break;
             }
         }
     }
     // The alignment must stay at the pose that the edges voted for.
-    if best.support < least {
-        return Err(Refusal::Support { found: best.support.max(0.0), needed: least });
+    if best.support < needed.support {
+        return Err(Refusal::Support { found: best.support.max(0.0), needed: needed.support });
     }
-    if !limit.admits(best.violation) {
-        return Err(Refusal::Violation { found: best.violation, allowed: limit.share() });
+    if best.edges < needed.edges {
+        return Err(Refusal::SinglePair { support: best.support });
+    }
+    if !allowed(&best) {
+        let allowed = needed.limit.share(best.support.min(candidate.support));
+        return Err(Refusal::Violation { found: best.violation, allowed });
     }
     Ok(best)
 }

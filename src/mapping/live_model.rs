@@ -1,6 +1,6 @@
 //! The model of a project, alive: scans come and go, and it is never recomputed unless asked.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -105,7 +105,7 @@ impl LiveModel {
         }
         let pairs = retrieve(&Retrieval::new(&next.graph), fresh, next.options.retrieved, control)?;
         next.try_pairs(&pairs, control)?;
-        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options);
+        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options, control)?;
         next.grow(control)?;
         *self = next;
         Ok(())
@@ -124,7 +124,7 @@ impl LiveModel {
         let mut next = self.clone();
         next.options.decisions = decisions;
         next.mapper.reopen(&concerned);
-        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options);
+        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options, control)?;
         next.grow(control)?;
         *self = next;
         Ok(())
@@ -274,19 +274,22 @@ impl LiveModel {
 
 /// How well each scan of a component is held.
 fn places(graph: &ScanGraph, component: &Component, index: usize) -> Vec<(ScanKey, RegisteredScan)> {
+    // Landmarks that each scan sees, and the sum of their squared distances.
+    let mut seen: BTreeMap<ScanKey, (usize, f64)> = BTreeMap::new();
+    for landmark in component.tracks.iter() {
+        for o in &landmark.observations {
+            let Some(model_from_local) = component.poses.get(&o.scan) else { continue };
+            let (landmarks, square) = seen.entry(o.scan).or_default();
+            *landmarks += 1;
+            *square += (model_from_local.transform(&o.point_in_scan) - landmark.position).norm_squared();
+        }
+    }
     component
         .poses
         .iter()
         .filter_map(|(key, model_from_local)| {
             let scan = graph.scan(*key)?;
-            let (mut landmarks, mut square) = (0_usize, 0.0);
-            for landmark in component.tracks.iter() {
-                for o in landmark.observations.iter().filter(|o| o.scan == *key) {
-                    landmarks += 1;
-                    square +=
-                        (model_from_local.transform(&o.point_in_scan) - landmark.position).norm_squared();
-                }
-            }
+            let (landmarks, square) = seen.get(key).copied().unwrap_or_default();
             let neighbours = graph
                 .neighbors(*key)
                 .filter(|other| component.poses.contains_key(other))

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::bent_join::bent_join;
 use super::candidates::{CLUSTERS, Candidate, candidates};
 use super::component::Component;
-use super::consistency::{supports, weakest_cut};
+use super::consistency::{loose_side, supports};
 use super::guarded::{guarded, refined};
 use super::initial_pair::initial_pairs;
 use super::join::{Refusal, weigh_join};
@@ -29,6 +29,17 @@ struct NextScan {
     visible: (usize, usize),
 }
 
+/// A join that was weighed and not made.
+#[derive(Debug, Clone, Copy)]
+struct Refused {
+    /// The support it had.
+    support: f64,
+    /// What the level asked for.
+    needed: f64,
+    /// Why.
+    refusal: Refusal,
+}
+
 /// The state of mapping: components, and scans that wait.
 #[derive(Debug, Clone, Default)]
 pub struct Mapper {
@@ -36,9 +47,8 @@ pub struct Mapper {
     pub components: Vec<Component>,
     /// Scans in no component, and why as far as known.
     pub waiting: BTreeMap<ScanKey, Option<Refusal>>,
-    /// Joins that were refused on sight of the surfaces, with the support and the level they had: not worth another look until the
-    /// support changes.
-    refused: BTreeMap<(ScanKey, ScanKey), (f64, f64)>,
+    /// Joins that were refused on sight of the surfaces: not worth another look until the support or the surfaces change.
+    refused: BTreeMap<(ScanKey, ScanKey), Refused>,
     /// How often each scan was filtered out, so that filtering ends.
     pub(super) filtered: BTreeMap<ScanKey, usize>,
     /// Joins since the whole model was refined last.
@@ -52,7 +62,7 @@ pub struct Mapper {
 }
 
 /// Pieces of at least this many scans are only joined on more support than the most lenient level asks.
-const LARGE_PIECE: usize = 3;
+pub(super) const LARGE_PIECE: usize = 3;
 
 impl Mapper {
     /// Number of registered scans.
@@ -89,7 +99,7 @@ impl Mapper {
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<Option<ScanKey>, Cancelled> {
-        for next in self.rank_next_scans(graph, level, voxel, options) {
+        for next in self.rank_next_scans(graph, level, voxel, options, control)? {
             control.check()?;
             let component = &self.components[next.component];
             let single = Component::single(next.scan);
@@ -113,7 +123,8 @@ impl Mapper {
                     return Ok(Some(next.scan));
                 }
                 Err(refusal) => {
-                    self.refused.insert(link, (next.support, level.support));
+                    let (support, needed) = (next.support, level.support);
+                    self.refused.insert(link, Refused { support, needed, refusal });
                     self.waiting.insert(next.scan, Some(refusal));
                 }
             }
@@ -128,9 +139,11 @@ impl Mapper {
         level: &JoinLevel,
         voxel: f64,
         options: &MappingOptions,
-    ) -> Vec<NextScan> {
+        control: Control<'_>,
+    ) -> Result<Vec<NextScan>, Cancelled> {
         let mut ranked = Vec::new();
         for scan in self.free() {
+            control.check()?;
             let single = Component::single(scan);
             for (index, component) in self.components.iter().enumerate() {
                 let candidates = candidates(graph, component, &single, voxel, options, CLUSTERS);
@@ -153,7 +166,7 @@ impl Mapper {
                 .then(x.scan.cmp(&y.scan))
                 .then(x.component.cmp(&y.component))
         });
-        ranked
+        Ok(ranked)
     }
 
     /// Initial pair: starts a component from two waiting scans. Returns whether one was started.
@@ -185,7 +198,7 @@ impl Mapper {
                     return Ok(true);
                 }
                 Err(refusal) => {
-                    self.refused.insert(link, (support, level.support));
+                    self.refused.insert(link, Refused { support, needed: level.support, refusal });
                     for scan in [first, second] {
                         self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
                     }
@@ -206,6 +219,7 @@ impl Mapper {
     ) -> Result<bool, Cancelled> {
         let mut ranked: Vec<(f64, usize, usize, Vec<Candidate>)> = Vec::new();
         for i in 0..self.components.len() {
+            control.check()?;
             for j in i + 1..self.components.len() {
                 let (a, b) = self.larger_first(i, j);
                 // A wrong join of two large pieces misplaces many scans, and pieces that large have more to say for each other.
@@ -215,8 +229,13 @@ impl Mapper {
                 let found =
                     candidates(graph, &self.components[a], &self.components[b], voxel, options, CLUSTERS);
                 match found.first() {
-                    // Two pieces share more than one edge, or what they share is a coincidence.
-                    Some(best) if !best.rests_on_several() && !options.is_strictest(level) => {}
+                    Some(best)
+                        if !best.rests_on_several()
+                            && options.asks_for_several(
+                                self.components[a].len(),
+                                self.components[b].len(),
+                                level,
+                            ) => {}
                     Some(best) if best.support >= level.support => {
                         ranked.push((best.margin(options), a, b, found));
                     }
@@ -251,7 +270,8 @@ impl Mapper {
                         self.joins_since_refinement += 1;
                         return Ok(true);
                     }
-                    self.refused.insert(link, (candidate.support, level.support));
+                    let (support, needed) = (candidate.support, level.support);
+                    self.refused.insert(link, Refused { support, needed, refusal });
                 }
             }
         }
@@ -283,7 +303,7 @@ impl Mapper {
         Ok(pairs)
     }
 
-    /// Refines every component that grew, then its tracks at the new poses.
+    /// Refines every component, then its tracks at the new poses.
     pub fn refine(
         &mut self,
         graph: &ScanGraph,
@@ -296,21 +316,30 @@ impl Mapper {
             component.tracks.filter(&component.poses, options.track_voxels * voxel, options.track_length);
         }
         self.joins_since_refinement = 0;
+        // Surfaces lie elsewhere now, and what was bent may be straight.
+        self.refused.clear();
         Ok(())
     }
 
     /// Takes apart what hangs together by less than `least` support, so that it is decided anew with all evidence there is now.
     /// What was joined leniently when little was known cannot poison the rest.
-    pub fn loosen(&mut self, graph: &ScanGraph, least: f64, options: &MappingOptions) {
+    pub fn loosen(
+        &mut self,
+        graph: &ScanGraph,
+        least: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<(), Cancelled> {
         let mut pending = std::mem::take(&mut self.components);
         while let Some(mut component) = pending.pop() {
+            control.check()?;
             let supports = supports(graph, &component, options);
-            match weakest_cut(&component, &supports) {
-                Some((side, cut)) if cut < least => {
+            match loose_side(&component, &supports, least) {
+                Some(side) => {
                     pending.extend(component.split_off(&side, options));
                     pending.push(component);
                 }
-                _ => self.components.push(component),
+                None => self.components.push(component),
             }
         }
         self.refused.clear();
@@ -323,6 +352,7 @@ impl Mapper {
         }
         self.dissolve_small();
         self.sort_components();
+        Ok(())
     }
 
     /// Waiting scans that may be joined.
@@ -349,7 +379,7 @@ impl Mapper {
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
-        self.open_joins = open_joins(graph, &self.components, &self.waiting, voxel, options, control)?;
+        self.open_joins = open_joins(graph, self, voxel, options, control)?;
         Ok(())
     }
 
@@ -370,9 +400,15 @@ impl Mapper {
     }
 
     fn already_refused(&self, link: (ScanKey, ScanKey), support: f64, level: &JoinLevel) -> bool {
-        self.refused
-            .get(&link)
-            .is_some_and(|(then, at)| (support - then).abs() < 0.05 * then.abs() && level.support >= *at)
+        self.refused.get(&link).is_some_and(|r| {
+            (support - r.support).abs() < 0.05 * r.support.abs() && level.support >= r.needed
+        })
+    }
+
+    /// Why two pieces were not joined when they were weighed last, if they were.
+    pub(super) fn refusal_between(&self, a: &Component, b: &Component) -> Option<Refusal> {
+        let known = |x: ScanKey, y: ScanKey| self.refused.get(&(x, y));
+        known(a.gauge, b.gauge).or_else(|| known(b.gauge, a.gauge)).map(|refused| refused.refusal)
     }
 
     pub(super) fn dissolve_small(&mut self) {
@@ -391,7 +427,12 @@ fn worse(known: Option<Refusal>, new: Refusal) -> Option<Refusal> {
         (Some(Refusal::Support { found, .. }), Refusal::Support { found: now, .. }) if now < found => known,
         (Some(Refusal::Contradicted { .. }), _)
         | (
-            Some(Refusal::Violation { .. } | Refusal::Rival { .. } | Refusal::Forbidden),
+            Some(
+                Refusal::Violation { .. }
+                | Refusal::Rival { .. }
+                | Refusal::Forbidden
+                | Refusal::SinglePair { .. },
+            ),
             Refusal::Support { .. },
         ) => known,
         _ => Some(new),

@@ -12,6 +12,7 @@ mod component;
 mod consistency;
 mod decision;
 mod filter;
+mod gravity;
 mod guarded;
 mod initial_pair;
 mod intrusion;

@@ -1,13 +1,12 @@
 //! Joins that were not made although something speaks for them: what a client may decide, or what one more scan may settle.
 
-use std::collections::BTreeMap;
-
 use serde::{Deserialize, Serialize};
 
 use super::candidates::{Candidate, candidates};
 use super::component::Component;
 use super::decision::between_own_frames;
 use super::join::{Refusal, pooled_fit};
+use super::mapper::{LARGE_PIECE, Mapper};
 use super::options::MappingOptions;
 use super::surfaces::{align, judge};
 use crate::cloud::ScanKey;
@@ -21,6 +20,8 @@ const POSES: usize = 4;
 const LISTED: usize = 40;
 /// A join with less support than this share of what a join needs is not worth a person's time.
 const WORTH_SHARE: f64 = 0.5;
+/// A pose that weighs less than this share of the heaviest is not offered beside it.
+const WORTH_NAMING: f64 = 0.02;
 
 /// One of the poses at which two pieces could be joined.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -75,13 +76,13 @@ pub struct Undone {
 /// Lists what could be joined but was not: between components, and between components or waiting scans and waiting scans.
 pub fn open_joins(
     graph: &ScanGraph,
-    components: &[Component],
-    waiting: &BTreeMap<ScanKey, Option<Refusal>>,
+    mapper: &Mapper,
     voxel: f64,
     options: &MappingOptions,
     control: Control<'_>,
 ) -> Result<Vec<OpenJoin>, Cancelled> {
     let Some(last) = options.levels.last() else { return Ok(Vec::new()) };
+    let Mapper { components, waiting, .. } = mapper;
     let singles: Vec<Component> = waiting.keys().map(|key| Component::single(*key)).collect();
     let pieces: Vec<&Component> = components.iter().chain(&singles).collect();
     let mut found: Vec<(f64, usize, usize, Vec<Candidate>)> = Vec::new();
@@ -104,9 +105,14 @@ pub fn open_joins(
         let Some((best, member)) = poses.first().and_then(|best| Some((best, best.members.first()?))) else {
             continue;
         };
+        let word = |candidate: &Candidate| candidate.support.max(candidate.doubt);
+        let least = WORTH_NAMING * poses.iter().map(word).fold(0.0, f64::max);
         let mut weighed: Vec<RivalPose> = Vec::with_capacity(poses.len());
         let mut violation = 0.0;
         for (rank, candidate) in poses.iter().enumerate() {
+            if rank > 0 && word(candidate) < least {
+                continue;
+            }
             let a_from_b = align(graph, a, b, &pooled_fit(graph, a, b, candidate, voxel), voxel);
             let counts = judge(graph, a, b, &a_from_b);
             if rank == 0 {
@@ -128,18 +134,24 @@ pub fn open_joins(
                 inliers: counts.inliers,
             });
         }
-        let known = [a, b].iter().filter(|c| c.len() == 1).find_map(|c| match waiting.get(&c.gauge) {
+        let contradicted = [a, b].iter().filter(|c| c.len() == 1).find_map(|c| match waiting.get(&c.gauge) {
             Some(Some(refusal @ Refusal::Contradicted { .. })) => Some(*refusal),
             _ => None,
         });
-        let refusal = known.unwrap_or(if best.decided {
-            Refusal::Forbidden
-        } else if best.support < last.support {
-            Refusal::Support { found: best.support, needed: last.support }
-        } else if best.margin(options) < last.support {
-            Refusal::Rival { support: best.support, rival: best.rival }
-        } else {
-            Refusal::Violation { found: violation, allowed: last.violation }
+        let refusal = contradicted.or_else(|| mapper.refusal_between(a, b)).unwrap_or_else(|| {
+            let large = a.len().min(b.len()) >= LARGE_PIECE;
+            let needed = if large { last.support.max(options.least_large_support) } else { last.support };
+            if best.decided {
+                Refusal::Forbidden
+            } else if best.support < needed {
+                Refusal::Support { found: best.support, needed }
+            } else if options.asks_for_several(a.len(), b.len(), last) && !best.rests_on_several() {
+                Refusal::SinglePair { support: best.support }
+            } else if best.margin(options) < needed {
+                Refusal::Rival { support: best.support, rival: best.rival }
+            } else {
+                Refusal::Violation { found: violation, allowed: last.violation }
+            }
         });
         listed.push(OpenJoin {
             a: member.in_a,

@@ -72,6 +72,13 @@ impl MappingOptions {
         self.levels.iter().all(|other| other.support <= level.support)
     }
 
+    /// Whether a join of pieces of so many scans must rest on more than one edge: what two pieces of several scans share in one pair alone is
+    /// easily a coincidence.
+    #[must_use]
+    pub fn asks_for_several(&self, a: usize, b: usize, level: &JoinLevel) -> bool {
+        a > 1 && b > 1 && !self.is_strictest(level)
+    }
+
     /// The levels at which joins are firm: what they put together needs no second thought.
     #[must_use]
     pub fn firm_levels(&self) -> &[JoinLevel] {

@@ -34,7 +34,7 @@ pub fn grow(
         let all = weakly && mapper.doubted.is_empty();
         let levels = if all { &options.levels } else { options.firm_levels() };
         join_all(mapper, graph, levels, voxel, &options, control)?;
-        if mapper.filter_scans(graph, voxel, &options) > 0 {
+        if mapper.filter_scans(graph, voxel, &options, control)? > 0 {
             continue;
         }
         if let Some(bans) = mapper.undo_contradicted(graph, voxel, &options, control)? {

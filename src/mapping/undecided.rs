@@ -7,10 +7,11 @@ use std::collections::BTreeSet;
 
 use super::candidates::{CLUSTERS, candidates};
 use super::component::Component;
-use super::consistency::{CLEARLY_DIFFERENT, Contradiction, Testimony};
+use super::consistency::{CLEARLY_DIFFERENT, Contradiction, Testimony, smaller_side};
 use super::join::{Refusal, weigh_join};
 use super::options::{JoinLevel, MappingOptions};
 use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
 use crate::graph::{ScanGraph, softplus};
 use crate::pairwise::centred_difference;
@@ -42,7 +43,8 @@ pub fn undecided(
     testimony: &Testimony,
     voxel: f64,
     options: &MappingOptions,
-) -> Option<Undecided> {
+    control: Control<'_>,
+) -> Result<Option<Undecided>, Cancelled> {
     let votes = Votes::of(graph, component, options);
     let mut cuts: Vec<(f64, BTreeSet<ScanKey>, Contradiction)> = Vec::new();
     for strongest in testimony.inside(component).take(TRIED) {
@@ -50,6 +52,7 @@ pub fn undecided(
             continue;
         };
         for alone in [true, false] {
+            control.check()?;
             let (weight, side) = votes.descend(a, b, alone);
             if weight < 0.0 && cuts.iter().all(|(_, known, _)| *known != side) {
                 cuts.push((weight, side, *strongest));
@@ -57,11 +60,13 @@ pub fn undecided(
         }
     }
     cuts.sort_by(|x, y| x.0.total_cmp(&y.0).then_with(|| x.1.cmp(&y.1)));
-    cuts.into_iter().find_map(|(_, side, strongest)| {
-        let rivals = reweigh(graph, component, &side, voxel, options)?;
-        let side = smaller_side(component, side);
-        Some(Undecided { side, strongest, rivals })
-    })
+    for (_, side, strongest) in cuts {
+        control.check()?;
+        if let Some(rivals) = reweigh(graph, component, &side, voxel, options) {
+            return Ok(Some(Undecided { side: smaller_side(component, side), strongest, rivals }));
+        }
+    }
+    Ok(None)
 }
 
 /// Joins the two sides anew: `Some(true)` if rivals forbid it, `Some(false)` if another pose is better, `None` if it is what it was.
@@ -74,8 +79,9 @@ fn reweigh(
 ) -> Option<bool> {
     // What is joined already need show no least support; a rival may have its share of it, however firm it is.
     let level = JoinLevel { support: 0.0, ..*options.levels.last()? };
-    // A pose nearby is no other place.
+    // A pose nearby is no other place; and one pair may speak for what is joined already.
     let options = MappingOptions {
+        levels: vec![level],
         rival_share: 1.0 / NEARLY_AS_GOOD,
         rival_angle: CLEARLY_DIFFERENT * options.rival_angle,
         rival_voxels: CLEARLY_DIFFERENT * options.rival_voxels,
@@ -117,35 +123,27 @@ fn moved(
     })
 }
 
-/// The same cut by the side with fewer scans.
-pub fn smaller_side(component: &Component, side: BTreeSet<ScanKey>) -> BTreeSet<ScanKey> {
-    if 2 * side.len() > component.len() {
-        component.poses.keys().filter(|key| !side.contains(key)).copied().collect()
-    } else {
-        side
-    }
-}
-
-/// For every two scans of a component, the share of their support for where they are that a rival may have, less what they say for
+/// For every pair of a component's scans, the share of their support for where they are that a rival may have, less what they say for
 /// another pose: negative where they lean to it.
 struct Votes {
     keys: Vec<ScanKey>,
-    weights: Vec<f64>,
+    /// For each scan the others that it shares a pair with, and what the pair says.
+    links: Vec<Vec<(usize, f64)>>,
 }
 
 impl Votes {
     fn of(graph: &ScanGraph, component: &Component, options: &MappingOptions) -> Self {
         let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
-        let n = keys.len();
-        let mut votes = Self { keys, weights: vec![0.0; n * n] };
-        for i in 0..n {
-            for j in i + 1..n {
-                let vote = vote(graph, component, votes.keys[i], votes.keys[j], options).unwrap_or(0.0);
-                votes.weights[i * n + j] = vote;
-                votes.weights[j * n + i] = vote;
-            }
-        }
-        votes
+        let links = keys.iter().map(|a| {
+            let voters = graph.neighbors(*a).filter_map(|b| Some((keys.binary_search(&b).ok()?, b)));
+            voters
+                .filter_map(|(index, b)| {
+                    let (x, y) = (b.min(*a), b.max(*a));
+                    Some((index, vote(graph, component, x, y, options)?))
+                })
+                .collect()
+        });
+        Self { links: links.collect(), keys }
     }
 
     fn index(&self, key: ScanKey) -> Option<usize> {
@@ -157,23 +155,24 @@ impl Votes {
     fn descend(&self, from: usize, to: usize, alone: bool) -> (f64, BTreeSet<ScanKey>) {
         let n = self.keys.len();
         let mut inside: Vec<bool> = (0..n).map(|i| if alone { i == from } else { i != to }).collect();
-        let weight = |i: usize, j: usize| self.weights[i * n + j];
+        // By how much the cut grows when a scan changes sides.
+        let mut gains: Vec<f64> = (0..n)
+            .map(|i| self.links[i].iter().map(|&(j, w)| if inside[j] == inside[i] { w } else { -w }).sum())
+            .collect();
         // Every move makes the cut lighter, so no division comes twice.
         loop {
-            let gain = |i: usize| -> f64 {
-                (0..n).map(|j| if inside[j] == inside[i] { weight(i, j) } else { -weight(i, j) }).sum()
-            };
             let lightest = (0..n)
                 .filter(|i| *i != from && *i != to)
-                .map(|i| (gain(i), i))
-                .min_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
-            match lightest {
-                Some((gain, i)) if gain < NO_GAIN => inside[i] = !inside[i],
-                _ => break,
+                .min_by(|x, y| gains[*x].total_cmp(&gains[*y]).then(x.cmp(y)));
+            let Some(moved) = lightest.filter(|i| gains[*i] < NO_GAIN) else { break };
+            inside[moved] = !inside[moved];
+            gains[moved] = -gains[moved];
+            for &(other, weight) in &self.links[moved] {
+                gains[other] += if inside[other] == inside[moved] { 2.0 * weight } else { -2.0 * weight };
             }
         }
-        let across = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
-        let cut = across.filter(|&(i, j)| inside[i] != inside[j]).map(|(i, j)| weight(i, j)).sum();
+        let outward = (0..n).filter(|i| inside[*i]).flat_map(|i| &self.links[i]);
+        let cut = outward.filter(|(other, _)| !inside[*other]).map(|(_, weight)| weight).sum();
         (cut, (0..n).filter(|i| inside[*i]).map(|i| self.keys[i]).collect())
     }
 }
@@ -207,17 +206,18 @@ mod tests {
     #[test]
     fn the_halves_that_lean_to_another_pose_are_found() {
         // Two triangles that hold firmly; across, most pairs lean the other way.
-        let n = 6;
-        let mut votes = Votes { keys: (1..=6).map(ScanKey).collect(), weights: vec![0.0; n * n] };
-        for i in 0..n {
-            for j in 0..n {
-                if i != j {
-                    votes.weights[i * n + j] = if (i < 3) == (j < 3) { 4.0 } else { -0.5 };
+        let weight = |i: usize, j: usize| match (i.min(j), i.max(j)) {
+            (2, 3) => 1.0,
+            (i, j) => {
+                if (i < 3) == (j < 3) {
+                    4.0
+                } else {
+                    -0.5
                 }
             }
-        }
-        votes.weights[2 * n + 3] = 1.0;
-        votes.weights[3 * n + 2] = 1.0;
+        };
+        let link = |i: usize| (0..6).filter(|j| *j != i).map(|j| (j, weight(i, j))).collect();
+        let votes = Votes { keys: (1..=6).map(ScanKey).collect(), links: (0..6).map(link).collect() };
         let (weight, side) = votes.descend(0, 5, true);
         assert_eq!(side, (1..=3).map(ScanKey).collect());
         assert!((weight - (8.0 * -0.5 + 1.0)).abs() < 1e-12);

@@ -7,14 +7,14 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::candidates::best_candidate;
 use super::component::Component;
-use super::consistency::{Contradiction, Testimony, separating_cut, supports, testimony};
+use super::consistency::{Contradiction, Testimony, separating_cut, smaller_side, supports, testimony};
 use super::decision::{Decision, between_own_frames};
 use super::intrusion::{Intrusion, intrusion};
 use super::join::Refusal;
 use super::mapper::Mapper;
 use super::open_join::Undone;
 use super::options::MappingOptions;
-use super::undecided::{Undecided, smaller_side, undecided};
+use super::undecided::{Undecided, undecided};
 use super::voice::{Word, one_voice};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
@@ -55,7 +55,8 @@ impl Mapper {
         while let Some(mut component) = pending.pop() {
             control.check()?;
             // Where a client joined scans, the client has the last word.
-            if options.decisions.joined_pairs().any(|pair| component.poses.contains_key(&pair.a)) {
+            let holds = |scan| component.poses.contains_key(&scan);
+            if options.decisions.joined_pairs().any(|pair| holds(pair.a) && holds(pair.b)) {
                 self.components.push(component);
                 continue;
             }
@@ -115,7 +116,7 @@ fn finding(
     if let Some((side, strongest)) = tear(AGAINST_SHARE) {
         return Ok(Finding::Torn { side, strongest });
     }
-    match undecided(graph, component, testimony, voxel, options) {
+    match undecided(graph, component, testimony, voxel, options, control)? {
         Some(Undecided { strongest, rivals: true, .. }) => return Ok(Finding::Folded { strongest }),
         Some(Undecided { side, strongest, .. }) => return Ok(Finding::Torn { side, strongest }),
         None => {}

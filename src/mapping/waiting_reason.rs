@@ -34,7 +34,7 @@ impl Mapper {
                 return WaitingReason::Contradicted { against, agreeing };
             }
             Some(Refusal::Forbidden) => return WaitingReason::Forbidden,
-            Some(Refusal::Support { found, .. }) => found,
+            Some(Refusal::Support { found, .. } | Refusal::SinglePair { support: found }) => found,
             None => 0.0,
         };
         if self.only_a_ban_keeps_out(scan, graph, voxel, needed, options) {

@@ -10,12 +10,18 @@ use crate::geometry::Pose;
 /// scanners are off by hundredths of a degree, inertial sensors in the hand by one or two.
 const COS_TILT: f64 = 0.994_521_895_368_273_3;
 
+/// Whether two upward directions, unit vectors in one frame, may be the same.
+#[must_use]
+pub fn is_level(up: &Vector3<f64>, other: &Vector3<f64>) -> bool {
+    up.dot(other) >= COS_TILT
+}
+
 /// Whether a pose leaves both scans upright, as far as they say where up is.
 #[must_use]
 pub fn is_upright(a: &Scan, b: &Scan, a_from_b: &Pose) -> bool {
     match (a.prepared.up, b.prepared.up) {
         (Some(in_a), Some(in_b)) => {
-            (a_from_b.rotation * Vector3::from(in_b)).dot(&Vector3::from(in_a)) >= COS_TILT
+            is_level(&Vector3::from(in_a), &(a_from_b.rotation * Vector3::from(in_b)))
         }
         _ => true,
     }

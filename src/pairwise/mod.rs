@@ -18,7 +18,7 @@ pub use appearance::{Appearance, appearance};
 pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, agreement, centred_difference, consensus};
 pub(crate) use contacts::{Contacts, Motion};
 pub use dense::{Counts, look, quick_overlap};
-pub use gravity::is_upright;
+pub use gravity::{is_level, is_upright};
 pub use icp::{icp, perturbed_about};
 pub use matching::{Match, mutual_matches};
 pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};

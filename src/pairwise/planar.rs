@@ -5,6 +5,7 @@
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
+use super::gravity::is_upright;
 use crate::features::{Offsets, PlaneProfile, Scan};
 use crate::geometry::Pose;
 
@@ -12,7 +13,7 @@ use crate::geometry::Pose;
 const PEAKS: usize = 10;
 
 /// The most promising motions by how much surface of like orientation they bring to like offsets: at most `keep`, best first, as
-/// a from b in the local frames. None where either scan has no plane profile.
+/// a from b in the local frames. None where either scan has no plane profile, and none that would tip a scan over.
 #[must_use]
 pub fn planar_poses(a: &Scan, b: &Scan, keep: usize) -> Vec<Pose> {
     let (Some(in_a), Some(in_b)) = (&a.planes, &b.planes) else { return Vec::new() };
@@ -20,6 +21,9 @@ pub fn planar_poses(a: &Scan, b: &Scan, keep: usize) -> Vec<Pose> {
     let mut combined: Vec<(u32, usize, [i32; 3])> = Vec::new();
     let turns = quarter_turns();
     for (index, turn) in turns.iter().enumerate() {
+        if !is_upright(a, b, &Pose::new(rotation(in_a, in_b, turn), Vector3::zeros())) {
+            continue;
+        }
         let [x, y, z] = std::array::from_fn(|k| shifts.of(k, turn[k]));
         for &(amount_x, at_x) in x {
             for &(amount_y, at_y) in y {
@@ -39,18 +43,19 @@ pub fn planar_poses(a: &Scan, b: &Scan, keep: usize) -> Vec<Pose> {
     combined
         .into_iter()
         .map(|(_, turn, shift)| {
-            let mut turned = Matrix3::zeros();
-            for k in 0..3 {
-                let Side { axis, opposite } = turns[turn][k];
-                turned[(k, axis)] = if opposite { -1.0 } else { 1.0 };
-            }
-            let rotation = in_a.local_from_axes
-                * Rotation3::from_matrix_unchecked(turned)
-                * in_b.local_from_axes.inverse();
             let shift = Vector3::from(shift.map(f64::from)) * voxel;
-            Pose::new(rotation, in_a.local_from_axes * shift)
+            Pose::new(rotation(in_a, in_b, &turns[turn]), in_a.local_from_axes * shift)
         })
         .collect()
+}
+
+/// The rotation that lays the axes of b along those of a as a turn says.
+fn rotation(in_a: &PlaneProfile, in_b: &PlaneProfile, turn: &[Side; 3]) -> Rotation3<f64> {
+    let mut turned = Matrix3::zeros();
+    for (k, Side { axis, opposite }) in turn.iter().enumerate() {
+        turned[(k, *axis)] = if *opposite { -1.0 } else { 1.0 };
+    }
+    in_a.local_from_axes * Rotation3::from_matrix_unchecked(turned) * in_b.local_from_axes.inverse()
 }
 
 /// An axis of scan b, in its direction or against it.

@@ -35,7 +35,6 @@ pub fn shortlist(a: &Scan, b: &Scan, matches: &[Match], count: usize) -> Vec<Con
     if [a, b].iter().any(|scan| scan.prepared.range_image.is_some()) {
         let mut planar: Vec<(f64, Pose)> = planar_poses(a, b, PLANAR_POSES)
             .into_iter()
-            .filter(|pose| is_upright(a, b, pose))
             .map(|pose| (glance(a, b, &pose, FIRST_LOOK), pose))
             .collect();
         planar.sort_by(|x, y| y.0.total_cmp(&x.0));
