@@ -2,6 +2,7 @@
 //! scans support or contradict each hypothesis. Uses `pairwise`; used by `mapping`.
 
 mod centrality;
+mod memo;
 mod retrieval;
 mod scan_graph;
 mod support;

@@ -1,6 +1,6 @@
 //! Which pairs are worth matching: for each scan the others, the likeliest to overlap it first. Two stages: the global signatures of all
-//! scans, compared in microseconds; then a probe of the most similar ones (`pairwise::probe`), a third of a millisecond each.
-//! Nothing is kept between calls: the order for one scan among sixty costs some twenty milliseconds of CPU.
+//! scans, compared in microseconds; then a probe of the most similar ones (`pairwise::probe`), a third of a millisecond each, which the
+//! graph keeps: the order for a new scan among sixty costs some twenty milliseconds of CPU, and later none.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,7 +10,7 @@ use super::scan_graph::ScanGraph;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::features::SIGNATURE_LEN;
-use crate::pairwise::{PairKey, Probe, probe};
+use crate::pairwise::{PairKey, Probe};
 
 /// Scans that are probed for one scan, the most similar ones by signature; the others follow in the order of similarity.
 const PROBED: usize = 120;
@@ -61,8 +61,10 @@ impl<'g> Retrieval<'g> {
             .into_iter()
             .collect::<Vec<_>>()
             .into_par_iter()
-            .filter_map(|pair| Some((pair, self.graph.scan(pair.a)?, self.graph.scan(pair.b)?)))
-            .map(|(pair, a, b)| control.check().map(|()| (pair, probe(a, b))))
+            .filter_map(|pair| match control.check() {
+                Ok(()) => self.graph.probe(pair).map(|probe| Ok((pair, probe))),
+                Err(cancelled) => Some(Err(cancelled)),
+            })
             .collect::<Result<_, Cancelled>>()?;
         Ok(similar.into_iter().map(|(key, others)| (key, ranking(key, others, &probes))).collect())
     }

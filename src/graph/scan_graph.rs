@@ -5,12 +5,13 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::memo::Memo;
 use super::support::{SupportOptions, support};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control, Stage};
 use crate::features::Scan;
 use crate::geometry::Pose;
-use crate::pairwise::{Hypothesis, PairKey, PairResult, match_pair};
+use crate::pairwise::{Hypothesis, PairKey, PairResult, Probe, match_pair, probe};
 
 /// A hypothesis with what third scans say of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -63,6 +64,7 @@ pub struct ScanGraph {
     scans: BTreeMap<ScanKey, Arc<Scan>>,
     edges: BTreeMap<PairKey, Edge>,
     neighbors: BTreeMap<ScanKey, BTreeSet<ScanKey>>,
+    probes: Memo<Probe>,
 }
 
 impl ScanGraph {
@@ -82,6 +84,7 @@ impl ScanGraph {
         if self.scans.remove(&key).is_none() {
             return false;
         }
+        self.probes.forget(key);
         let around: Vec<ScanKey> = self.neighbors.remove(&key).into_iter().flatten().collect();
         for other in &around {
             self.edges.remove(&PairKey::of(key, *other));
@@ -120,6 +123,13 @@ impl ScanGraph {
     /// Scans that share a tried pair with `key`.
     pub fn neighbors(&self, key: ScanKey) -> impl Iterator<Item = ScanKey> + '_ {
         self.neighbors.get(&key).into_iter().flatten().copied()
+    }
+
+    /// What a probe of two scans tells; `None` if one is not there.
+    #[must_use]
+    pub fn probe(&self, pair: PairKey) -> Option<Probe> {
+        let (a, b) = (self.scans.get(&pair.a)?, self.scans.get(&pair.b)?);
+        Some(self.probes.answer(pair, || probe(a, b)))
     }
 
     /// Matches and verifies the pairs that were not tried yet, in parallel, adds them as edges and renews the support of every
