@@ -44,7 +44,7 @@ pub(super) async fn get_cloud(
     let (version, content) = api.store.content(project, version).await?;
     let blob = api.exports.cloud(project, &content, CloudRequest { component, voxel }).await?;
     let file_name = format!("cloud-{version}.ply");
-    serve(&api.store.blobs, Download { blob, media_type: "model/ply", file_name }, &headers).await
+    serve(&api.store, Download { blob, media_type: "model/ply", file_name }, &headers).await
 }
 
 /// `component` of a cloud or a picture.

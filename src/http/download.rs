@@ -1,18 +1,19 @@
 //! Files for download: strong ETags, conditional and partial requests (RFC 9110), streamed from the blob once it is known to be
 //! sound.
 
-use std::io::{ErrorKind, SeekFrom};
+use std::io::{self, ErrorKind, SeekFrom};
 
 use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
+use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncSeekExt};
 use tokio_util::io::ReaderStream;
 use utoipa::ToSchema;
 
 use super::Problem;
-use crate::storage::{BlobStore, StoredBlob};
+use crate::storage::{BlobId, BlobStore, StorageError, Store, StoredBlob};
 
 /// Bytes, in the words of OpenAPI.
 #[derive(ToSchema)]
@@ -35,7 +36,7 @@ const PIECE: usize = 128 * 1024;
 
 /// Answers with the blob, a range of it, or that the client has it already.
 pub(super) async fn serve(
-    blobs: &BlobStore,
+    store: &Store,
     download: Download,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
@@ -45,10 +46,10 @@ pub(super) async fn serve(
         StatusCode::NOT_MODIFIED.into_response()
     } else {
         match requested_range(headers, &etag, blob.bytes) {
-            Requested::Whole => body(blobs, &blob, 0, blob.bytes, StatusCode::OK).await?,
+            Requested::Whole => body(store, &blob, 0, blob.bytes, StatusCode::OK).await?,
             Requested::Range { first, last } => {
                 let mut response =
-                    body(blobs, &blob, first, last - first + 1, StatusCode::PARTIAL_CONTENT).await?;
+                    body(store, &blob, first, last - first + 1, StatusCode::PARTIAL_CONTENT).await?;
                 let range = format!("bytes {first}-{last}/{}", blob.bytes);
                 response.headers_mut().insert(header::CONTENT_RANGE, value(&range)?);
                 response
@@ -77,24 +78,41 @@ pub(super) fn none_match(headers: &HeaderMap, etag: &str) -> bool {
 }
 
 async fn body(
-    blobs: &BlobStore,
+    store: &Store,
     blob: &StoredBlob,
     first: u64,
     length: u64,
     status: StatusCode,
 ) -> Result<Response, Problem> {
-    let (checked, id) = (blobs.clone(), blob.id);
-    tokio::task::spawn_blocking(move || checked.verify(id)).await.map_err(Problem::internal)??;
-    let mut file = tokio::fs::File::open(blobs.path(blob.id)).await.map_err(|error| match error.kind() {
-        // Its row was there a moment ago: whom it belongs to was deleted meanwhile.
-        ErrorKind::NotFound => Problem::not_found("the file was deleted"),
-        _ => Problem::internal(error),
-    })?;
+    let mut file = open(store, blob.id).await?;
     file.seek(SeekFrom::Start(first)).await.map_err(Problem::internal)?;
     let stream = ReaderStream::with_capacity(file.take(length), PIECE);
     let mut response = (status, Body::from_stream(stream)).into_response();
     response.headers_mut().insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     Ok(response)
+}
+
+/// The file of a blob that a row named a moment ago. If it is not there, the row went meanwhile and took it along, or it is lost.
+async fn open(store: &Store, id: BlobId) -> Result<File, Problem> {
+    match sound(&store.blobs, id).await {
+        Err(StorageError::MissingBlob(_)) if !store.is_needed(id).await? => {
+            Err(Problem::not_found("the file was deleted"))
+        }
+        found => Ok(found?),
+    }
+}
+
+/// The file of a blob, once it is known to be sound.
+async fn sound(blobs: &BlobStore, id: BlobId) -> Result<File, StorageError> {
+    let failed = |source| StorageError::Io { action: "opening a file for download", source };
+    let checked = blobs.clone();
+    tokio::task::spawn_blocking(move || checked.verify(id))
+        .await
+        .map_err(|error| failed(io::Error::other(error)))??;
+    File::open(blobs.path(id)).await.map_err(|error| match error.kind() {
+        ErrorKind::NotFound => StorageError::MissingBlob(id.to_string()),
+        _ => failed(error),
+    })
 }
 
 fn unsatisfiable(bytes: u64) -> Result<Response, Problem> {

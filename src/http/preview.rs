@@ -37,5 +37,5 @@ pub(super) async fn get_preview(
     let (version, content) = api.store.content(project, version).await?;
     let blob = api.exports.preview(project, &content, component).await?;
     let file_name = format!("preview-{version}.png");
-    serve(&api.store.blobs, Download { blob, media_type: "image/png", file_name }, &headers).await
+    serve(&api.store, Download { blob, media_type: "image/png", file_name }, &headers).await
 }

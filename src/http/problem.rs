@@ -200,8 +200,6 @@ impl From<StorageError> for Problem {
             StorageError::DamagedUpload { .. } => {
                 Self::new(StatusCode::GONE, "upload-lost", format!("{error}; begin it anew"))
             }
-            // Its row was there a moment ago: whom it belongs to was deleted meanwhile, or the file is lost, which the log tells.
-            StorageError::MissingBlob(_) => Self::not_found("the file is not there"),
             error => match error.trouble() {
                 Some(trouble) => Self::unavailable(trouble, &error),
                 None => Self::internal(error),

@@ -177,7 +177,7 @@ pub(super) async fn get_original(
     let blob = StoredBlob { id: BlobId::parse(&scan.blob)?, bytes: scan.bytes };
     let download =
         Download { blob, media_type: "application/octet-stream", file_name: scan.name.as_str().to_owned() };
-    serve(&api.store.blobs, download, &headers).await
+    serve(&api.store, download, &headers).await
 }
 
 /// Deletes a scan. It is gone at once; the job takes it out of the model.

@@ -4,8 +4,11 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::sync::Arc;
 
+use sqlx::Row;
+
+use super::garbage::needed;
 use super::ledger::{Ledger, Stamp};
-use super::{BlobId, BlobStore, Finding, StorageError};
+use super::{BlobId, BlobStore, Finding, StorageError, Store};
 
 /// Bytes that are read at once to be hashed.
 const PIECE: usize = 1 << 20;
@@ -107,5 +110,16 @@ impl BlobStore {
             }
             Err(e) => Err(StorageError::io("opening a blob")(e)),
         }
+    }
+}
+
+impl Store {
+    /// Whether a row needs this blob now. If none does, its file may go at any moment, and it is no damage if it has gone.
+    pub async fn is_needed(&self, id: BlobId) -> Result<bool, StorageError> {
+        let row = sqlx::query(sqlx::AssertSqlSafe(format!("SELECT {} AS needed", needed("?1"))))
+            .bind(id.to_string())
+            .fetch_one(&self.read)
+            .await?;
+        Ok(row.try_get("needed")?)
     }
 }

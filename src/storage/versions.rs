@@ -51,6 +51,9 @@ impl Store {
         if content.as_ref().is_err_and(StorageError::is_damage) {
             // It is made again at once: readers wait for it.
             self.settle_damage().await?;
+            // If it was deleted or dropped meanwhile, its file went with it: then it is not there, and nothing is damaged.
+            self.project(project).await?;
+            self.version(project, number).await?;
         }
         Ok((number, content?))
     }

@@ -1,6 +1,7 @@
 //! Downloads: ranges, ETags, and versions that never change.
 
 use reqwest::{Response, header};
+use serde_json::Value;
 
 use crate::server::{Server, problem, room};
 
@@ -68,6 +69,29 @@ async fn the_cloud_of_a_version_is_the_same_file_for_ever() {
     assert!(all.bytes().await.unwrap().len() > bytes.len(), "the filter leaves points out");
     problem(server.get(&format!("{project}/cloud?component=99")).await, 404, "not-found").await;
     problem(server.get(&format!("{project}/cloud?voxel=0")).await, 400, "invalid-field").await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_lost_file_is_a_failure_of_the_service_and_a_deleted_one_is_not_there() {
+    let server = Server::start().await;
+    let project = server.project().await;
+    let (scan, _) = server.registered(&project, "a.ply", room(0.0)).await;
+    let (other, _) = server.registered(&project, "b.ply", room(0.3)).await;
+    let original = |scan: &Value| format!("{project}/scans/{}/original", scan["id"].as_str().unwrap());
+    let etag = server.get(&original(&scan)).await.headers()["etag"].to_str().unwrap().to_owned();
+    server.lose(etag.trim_matches('"'));
+    problem(server.get(&original(&scan)).await, 500, "internal-error").await;
+    assert_eq!(server.get(&original(&other)).await.status(), 200);
+
+    server.lose(&server.word("SELECT content FROM versions WHERE number = 1").await);
+    for path in ["versions/1", "poses?version=1", "graph?version=1"] {
+        problem(server.get(&format!("{project}/{path}")).await, 500, "internal-error").await;
+    }
+    problem(server.get(&format!("{project}/versions/99")).await, 404, "not-found").await;
+    let path = format!("{project}/scans/{}", other["id"].as_str().unwrap());
+    assert_eq!(server.client.delete(server.url(&path)).send().await.unwrap().status(), 202);
+    problem(server.get(&original(&other)).await, 404, "not-found").await;
     server.stop().await;
 }
 

@@ -66,6 +66,21 @@ impl Server {
         database.close().await.unwrap();
     }
 
+    /// The word that a query finds in the database.
+    pub async fn word(&self, query: &'static str) -> String {
+        let options = SqliteConnectOptions::new().filename(self.data.path().join("cairn.sqlite"));
+        let mut database = SqliteConnection::connect_with(&options).await.unwrap();
+        let word = sqlx::query_scalar(query).fetch_one(&mut database).await.unwrap();
+        database.close().await.unwrap();
+        word
+    }
+
+    /// Removes the file of a blob behind the service's back.
+    pub fn lose(&self, blob: &str) {
+        let folder = self.data.path().join("blobs").join(&blob[..2]).join(&blob[2..4]);
+        std::fs::remove_file(folder.join(blob)).unwrap();
+    }
+
     /// Files in a folder of the data directory.
     pub fn files(&self, folder: &str) -> usize {
         std::fs::read_dir(self.data.path().join(folder)).unwrap().count()
