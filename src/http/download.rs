@@ -1,7 +1,7 @@
 //! Files for download: strong ETags, conditional and partial requests (RFC 9110), streamed from the blob once it is known to be
 //! sound.
 
-use std::io::{self, ErrorKind, SeekFrom};
+use std::io::{ErrorKind, SeekFrom};
 
 use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -104,14 +104,10 @@ async fn open(store: &Store, id: BlobId) -> Result<File, Problem> {
 
 /// The file of a blob, once it is known to be sound.
 async fn sound(blobs: &BlobStore, id: BlobId) -> Result<File, StorageError> {
-    let failed = |source| StorageError::Io { action: "opening a file for download", source };
-    let checked = blobs.clone();
-    tokio::task::spawn_blocking(move || checked.verify(id))
-        .await
-        .map_err(|error| failed(io::Error::other(error)))??;
-    File::open(blobs.path(id)).await.map_err(|error| match error.kind() {
+    blobs.check(id).await?;
+    File::open(blobs.path(id)).await.map_err(|source| match source.kind() {
         ErrorKind::NotFound => StorageError::MissingBlob(id.to_string()),
-        _ => failed(error),
+        _ => StorageError::Io { action: "opening a file for download", source },
     })
 }
 

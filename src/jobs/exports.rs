@@ -170,11 +170,7 @@ impl Exports {
     /// The remembered file, if it is sound: one that is not is made again.
     async fn remembered(&self, key: &blake3::Hash) -> Result<Option<StoredBlob>, ExportError> {
         let Some(found) = self.store.derived(key).await? else { return Ok(None) };
-        let blobs = self.store.blobs.clone();
-        let verified = tokio::task::spawn_blocking(move || blobs.verify(found.id))
-            .await
-            .map_err(|e| Panicked(e.to_string()))?;
-        match verified {
+        match self.store.blobs.check(found.id).await {
             Ok(()) => Ok(Some(found)),
             Err(error) => {
                 tracing::warn!(%error, "an export is damaged and is made again");

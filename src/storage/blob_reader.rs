@@ -91,6 +91,15 @@ impl BlobStore {
         if self.ledger.knows(id, stamp) { Ok(()) } else { self.reader(id)?.verify() }
     }
 
+    /// Like [`Self::verify`], for those who wait: however many do, the file is read once, and few are read at a time.
+    pub async fn check(&self, id: BlobId) -> Result<(), StorageError> {
+        if self.is_known_sound(id) {
+            return Ok(());
+        }
+        let blobs = self.clone();
+        self.checks.found(id, move || blobs.verify(id)).await
+    }
+
     /// Whether the blob's file was found or made sound lately, and did not change since.
     pub(super) fn is_known_sound(&self, id: BlobId) -> bool {
         fs::metadata(self.path(id)).is_ok_and(|metadata| self.ledger.knows(id, Stamp::of(&metadata)))

@@ -17,6 +17,7 @@ use ulid::Ulid;
 
 use super::StorageError;
 use super::blob_writer::Partial;
+use super::checks::Checks;
 use super::ledger::{Ledger, Stamp};
 use super::pins::{FreshBlob, Pin, Pins};
 
@@ -54,6 +55,7 @@ pub struct BlobStore {
     root: Arc<Path>,
     pins: Arc<Pins>,
     pub(super) ledger: Arc<Ledger>,
+    pub(super) checks: Arc<Checks>,
     /// Folders whose names are known to be synced.
     folders: Arc<Mutex<HashSet<[u8; 2]>>>,
 }
@@ -80,7 +82,13 @@ impl BlobStore {
 
     /// Opens the folder `root`, which another process may be writing to: nothing is thrown away.
     pub(super) fn beside(root: &Path) -> Self {
-        Self { root: root.into(), pins: Arc::default(), ledger: Arc::default(), folders: Arc::default() }
+        Self {
+            root: root.into(),
+            pins: Arc::default(),
+            ledger: Arc::default(),
+            checks: Arc::default(),
+            folders: Arc::default(),
+        }
     }
 
     /// The folder.

@@ -8,6 +8,7 @@ mod backup;
 mod blob_reader;
 mod blob_writer;
 mod blobs;
+mod checks;
 mod claims;
 mod damage;
 mod decisions;
