@@ -26,8 +26,12 @@ const GREY: [u8; 3] = [160; 3];
 /// Beyond this distance from zero single precision loses millimetres, and the file gets an offset, metres.
 const FAR: f64 = 5_000.0;
 
-/// Cubes that a thinned cloud may have: they are all in memory at once, about 100 bytes each.
-const MOST_CUBES: u64 = 16_000_000;
+/// Cubes that a thinned cloud may have: all are in memory at once, in a table that doubles when seven eighths of it are full. These fill
+/// one of 2^22 places; while it is made of one with half as many, both take 0.56 GB.
+const MOST_CUBES: u64 = 7 << 19;
+
+/// A component, and the cube in its frame.
+type Cube = (usize, [i64; 3]);
 
 /// Points of one cube.
 #[derive(Default)]
@@ -77,7 +81,7 @@ impl Merge {
 
     /// One point for each occupied cube of this edge (metres): the mean of the points in it, in the order of the cubes.
     pub fn thinned(&self, offset: &[f64; 3], edge: f64) -> Result<Vec<(Point, [u8; 3])>, ExportError> {
-        let mut cells: HashMap<(usize, [i64; 3]), Cell> = HashMap::new();
+        let mut cells: HashMap<Cube, Cell> = HashMap::new();
         let mut left = MOST_CUBES;
         self.visit(offset, |component, point, color| {
             let cube = (point / edge).map(|x| x.floor() as i64);
@@ -92,9 +96,10 @@ impl Merge {
             }
             Ok(())
         })?;
-        let mut cells: Vec<_> = cells.into_iter().collect();
-        cells.sort_unstable_by_key(|(cube, _)| *cube);
-        Ok(cells.into_iter().map(|(_, cell)| cell.mean()).collect())
+        // Means are half as large as what they are made of, and the table is in memory until all have left it.
+        let mut means: Vec<(Cube, _)> = cells.into_iter().map(|(cube, cell)| (cube, cell.mean())).collect();
+        means.sort_unstable_by_key(|(cube, _)| *cube);
+        Ok(means.into_iter().map(|(_, mean)| mean).collect())
     }
 }
 
@@ -103,5 +108,25 @@ impl Cell {
         let mean = self.sum / self.points as f64;
         let color = self.color.map(|sum| u8::try_from(sum / self.points.max(1)).unwrap_or(u8::MAX));
         ([mean.x as f32, mean.y as f32, mean.z as f32], color)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Bytes that are stated in docs/operations.md.
+    const STATED: usize = 600_000_000;
+
+    #[test]
+    fn a_thinned_cloud_takes_no_more_memory_than_is_stated() {
+        // A place of the table is an entry and a byte that says whether it is taken.
+        let (entry, mean) = (size_of::<(Cube, Cell)>() + 1, size_of::<(Cube, (Point, [u8; 3]))>());
+        let most = MOST_CUBES as usize;
+        let full = HashMap::<Cube, Cell>::with_capacity(most);
+        assert_eq!(full.capacity(), most, "the table is as full as it may be");
+        let places = most / 7 * 8;
+        assert!((places + places / 2) * entry < STATED, "while it grows");
+        assert!(places * entry + most * mean < STATED, "while means are made of it");
     }
 }
