@@ -110,12 +110,7 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         store: store.clone(),
         resumable: Resumable::new(store.clone(), intake.clone(), config.upload_expiry, stop.clone()),
         intake,
-        exports: Exports::new(
-            store.clone(),
-            compute.clone(),
-            config.workers.max_points,
-            config.load.free_bytes,
-        ),
+        exports: Exports::new(store.clone(), compute.clone(), config.workers.max_points, config.exports),
         access: Access {
             openness,
             origins: config.origins.into(),

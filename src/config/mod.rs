@@ -16,7 +16,7 @@ pub use settings::Settings;
 
 use crate::http::{ConnectionLimits, LoadLimits, Proxies, RateLimits};
 use crate::jobs::webhooks::{CourierOptions, Targets};
-use crate::jobs::{IntakeLimits, Isolated, WorkerOptions};
+use crate::jobs::{ExportLimits, IntakeLimits, Isolated, WorkerOptions};
 use crate::project::Limits;
 
 /// What the service runs with.
@@ -51,6 +51,8 @@ pub struct Config {
     pub proxies: Proxies,
     /// When no more work is taken on.
     pub load: LoadLimits,
+    /// What files that are made for download may take of the disk.
+    pub exports: ExportLimits,
     /// What each project may have.
     pub project_limits: Limits,
     /// How webhooks are told.
@@ -146,6 +148,10 @@ impl Settings {
                 open_jobs: within("max-open-jobs", self.max_open_jobs.unwrap_or(100_000), 1, 1 << 40)?,
                 free_bytes,
             },
+            exports: ExportLimits {
+                bytes: self.max_export_bytes.unwrap_or(16 << 30),
+                free_bytes: free_bytes.saturating_mul(2),
+            },
             project_limits: Limits {
                 bytes: self.project_max_bytes,
                 scans: self.project_max_scans,
@@ -195,6 +201,14 @@ mod tests {
         assert_eq!((config.workers.workers, config.workers.lease), (3, Duration::from_mins(1)));
         let message = Settings { workers: Some(0), ..Settings::default() }.resolve().unwrap_err().to_string();
         assert_eq!(message, "workers is 0; it must be between 1 and 256");
+    }
+
+    #[test]
+    fn downloads_leave_more_of_the_disk_than_uploads_need() {
+        let config = Settings { min_free_bytes: Some(1000), ..Settings::default() }.resolve().unwrap();
+        assert_eq!((config.intake.free_bytes, config.exports.free_bytes), (1000, 2000));
+        let limited = Settings { max_export_bytes: Some(5), ..Settings::default() }.resolve().unwrap();
+        assert_eq!(limited.exports.bytes, 5);
     }
 
     #[test]

@@ -100,6 +100,9 @@ pub struct Settings {
     /// Bytes of disk that must be free; with less, work is refused with 503 [default: 1073741824, which is 1 GiB]
     #[arg(long, env = "CAIRN_MIN_FREE_BYTES", value_name = "BYTES")]
     pub min_free_bytes: Option<u64>,
+    /// Bytes that merged clouds and pictures may have together; the oldest go first [default: 17179869184, which is 16 GiB]
+    #[arg(long, env = "CAIRN_MAX_EXPORT_BYTES", value_name = "BYTES")]
+    pub max_export_bytes: Option<u64>,
     /// Bytes of scans that a project may have [default: no limit]
     #[arg(long, env = "CAIRN_PROJECT_MAX_BYTES", value_name = "BYTES")]
     pub project_max_bytes: Option<u64>,
@@ -168,6 +171,7 @@ impl Settings {
             idle_seconds: self.idle_seconds.or(other.idle_seconds),
             max_open_jobs: self.max_open_jobs.or(other.max_open_jobs),
             min_free_bytes: self.min_free_bytes.or(other.min_free_bytes),
+            max_export_bytes: self.max_export_bytes.or(other.max_export_bytes),
             project_max_bytes: self.project_max_bytes.or(other.project_max_bytes),
             project_max_scans: self.project_max_scans.or(other.project_max_scans),
             project_max_queued_jobs: self.project_max_queued_jobs.or(other.project_max_queued_jobs),

@@ -68,12 +68,22 @@ pub enum ExportError {
     Unreadable(#[from] JobError),
 }
 
+/// What exports may take of the disk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ExportLimits {
+    /// Bytes that they may have together; only the newest alone may have more.
+    pub bytes: u64,
+    /// Bytes that must stay free: more than uploads leave free, so that readers never take the last room for uploads.
+    pub free_bytes: u64,
+}
+
 /// Makes and remembers exports. Clones share everything.
 #[derive(Debug, Clone)]
 pub struct Exports {
     store: Store,
     compute: Compute,
     max_points: u64,
+    limits: ExportLimits,
     disk: Disk,
     /// One at a time: a merged cloud may take gigabytes of disk and all threads.
     building: Arc<Mutex<()>>,
@@ -101,12 +111,20 @@ const LOOK_EVERY: u64 = 2_000_000;
 const FORM: &str = "export/1";
 
 impl Exports {
-    /// Exports from this store. Uploads of more than `max_points` were never accepted; nothing new is made while fewer than
-    /// `free_bytes` of disk are free.
+    /// Exports from this store. Uploads of more than `max_points` were never accepted.
     #[must_use]
-    pub fn new(store: Store, compute: Compute, max_points: u64, free_bytes: u64) -> Self {
-        let disk = Disk { store: store.clone(), free_bytes };
-        Self { store, compute, max_points, disk, building: Arc::default() }
+    pub fn new(store: Store, compute: Compute, max_points: u64, limits: ExportLimits) -> Self {
+        let disk = Disk { store: store.clone(), free_bytes: limits.free_bytes };
+        Self { store, compute, max_points, limits, disk, building: Arc::default() }
+    }
+
+    /// Gives up all that was made, because the disk is needed for something else: it can be made again.
+    pub async fn give_way(&self) -> Result<(), StorageError> {
+        let files = self.store.forget_exports().await?;
+        if files > 0 {
+            tracing::warn!(files, "little disk is free: merged clouds and pictures are deleted");
+        }
+        Ok(())
     }
 
     /// The merged cloud of a version as binary PLY, in metres, in the frame of its component.
@@ -154,14 +172,18 @@ impl Exports {
         if let Some(found) = self.remembered(&key).await? {
             return Ok(found);
         }
-        self.disk.check()?;
-        let (compute, store) = (self.compute.clone(), self.store.clone());
+        if let Err(error) = self.disk.check() {
+            self.give_way().await?;
+            return Err(error);
+        }
+        let (compute, store, limit) = (self.compute.clone(), self.store.clone(), self.limits.bytes);
         // A computation does not stop when its client leaves, so the turn stays with it: clients that come and go would have any
         // number of them run at once.
         let making = async move {
             let _turn = turn;
             let fresh = compute.run(make).await??;
             store.remember(&key, Owner { project, scan: None }, &fresh).await?;
+            store.limit_exports(limit).await?;
             Ok(*fresh)
         };
         tokio::spawn(making.in_current_span()).await.map_err(|e| Panicked(e.to_string()))?
@@ -282,5 +304,30 @@ mod tests {
         let folders = std::fs::read_dir(at.dir.path().join("blobs")).unwrap();
         let partial = folders.filter(|entry| entry.as_ref().unwrap().path().is_file()).count();
         assert_eq!(partial, 0, "what was begun is gone");
+    }
+
+    #[tokio::test]
+    async fn exports_keep_to_their_bytes_and_give_way_when_the_disk_is_nearly_full() {
+        let at = Fixture::new().await;
+        let exports = |bytes, free_bytes| {
+            let limits = ExportLimits { bytes, free_bytes };
+            Exports::new(at.store.clone(), Compute::new(1).unwrap(), 9, limits)
+        };
+        let made = async |exports: &Exports, name: &'static str| {
+            let blobs = at.store.blobs.clone();
+            let make = move || Ok(blobs.put(name.as_bytes())?);
+            exports.made(at.project, blake3::hash(name.as_bytes()), make).await
+        };
+        let kept =
+            async |name: &str| at.store.derived(&blake3::hash(name.as_bytes())).await.unwrap().is_some();
+        let roomy = exports(10, 0);
+        for name in ["first", "next", "last"] {
+            assert_eq!(made(&roomy, name).await.unwrap().bytes, name.len() as u64);
+        }
+        assert_eq!((kept("first").await, kept("next").await, kept("last").await), (false, true, true));
+        let full = exports(10, u64::MAX);
+        assert!(made(&full, "next").await.is_ok(), "what is there is given");
+        assert!(matches!(made(&full, "another").await, Err(ExportError::LowDisk)));
+        assert!(!kept("next").await && !kept("last").await);
     }
 }

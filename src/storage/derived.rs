@@ -1,7 +1,8 @@
 //! Which blob holds the result of a computation, by the hash of what went into it.
 //!
 //! Results of one scan go with it. Those of several are files that readers asked for, with parameters of their own choice: of these each
-//! project keeps the newest, or reading alone would fill the disk. What is gone is made again when it is asked for.
+//! project keeps the newest, and all together have a limit in bytes, or reading alone would fill the disk. What is gone is made again when
+//! it is asked for.
 
 use sqlx::Row;
 
@@ -70,6 +71,35 @@ impl Store {
         tx.commit().await?;
         Ok(())
     }
+
+    /// Forgets files that readers asked for, of any project, the oldest first, until the others have at most `bytes` together. The newest
+    /// stays, however large it is: somebody is about to read it.
+    pub async fn limit_exports(&self, bytes: u64) -> Result<(), StorageError> {
+        let mut tx = self.begin().await?;
+        sqlx::query(
+            "DELETE FROM derived WHERE rowid IN (SELECT id FROM
+               (SELECT rowid AS id, sum(bytes) OVER newest AS together, row_number() OVER newest AS place
+                  FROM derived WHERE scan_id IS NULL WINDOW newest AS (ORDER BY created_ms DESC, rowid DESC))
+               WHERE place > 1 AND together > ?)",
+        )
+        .bind(i64::try_from(bytes).unwrap_or(i64::MAX))
+        .execute(&mut *tx)
+        .await?;
+        tx.commit().await?;
+        Ok(())
+    }
+
+    /// Forgets all files that readers asked for. Returns how many there were.
+    pub async fn forget_exports(&self) -> Result<u64, StorageError> {
+        let any = sqlx::query("SELECT 1 FROM derived WHERE scan_id IS NULL LIMIT 1");
+        if any.fetch_optional(&self.read).await?.is_none() {
+            return Ok(0);
+        }
+        let mut tx = self.begin().await?;
+        let gone = sqlx::query("DELETE FROM derived WHERE scan_id IS NULL").execute(&mut *tx).await?;
+        tx.commit().await?;
+        Ok(gone.rows_affected())
+    }
 }
 
 #[cfg(test)]
@@ -77,6 +107,7 @@ mod tests {
     use super::*;
     use crate::project::{Name, ProjectSettings};
     use crate::storage::Seal;
+    use crate::storage::testing::{Fixture, new_scan, project};
 
     #[tokio::test]
     async fn a_project_keeps_the_newest_files_that_readers_asked_for_and_others_keep_theirs() {
@@ -102,5 +133,36 @@ mod tests {
         for n in 0..KEPT + 5 {
             assert_eq!(store.derived(&key(n)).await.unwrap().is_some(), n >= 5, "{n}");
         }
+    }
+
+    #[tokio::test]
+    async fn files_that_readers_asked_for_have_a_limit_in_bytes_whatever_project_they_are_of() {
+        let f = Fixture::new().await;
+        let other = project(&f.store).await;
+        let scan = f.store.admit_scan(&new_scan(other, 1, *f.blob("scan"))).await.unwrap().scan.id;
+        let key = |name: &str| blake3::hash(name.as_bytes());
+        let files =
+            [("a", f.project, None), ("bb", other, None), ("cc", other, None), ("prep", other, Some(scan))];
+        for (name, project, scan) in files {
+            f.store.remember(&key(name), Owner { project, scan }, &f.blob(name)).await.unwrap();
+        }
+        let left = async || {
+            let mut left = Vec::new();
+            for (name, ..) in files {
+                if f.store.derived(&key(name)).await.unwrap().is_some() {
+                    left.push(name);
+                }
+            }
+            left
+        };
+        f.store.limit_exports(5).await.unwrap();
+        assert_eq!(left().await, ["a", "bb", "cc", "prep"]);
+        f.store.limit_exports(4).await.unwrap();
+        assert_eq!(left().await, ["bb", "cc", "prep"], "the oldest goes first");
+        f.store.limit_exports(0).await.unwrap();
+        assert_eq!(left().await, ["cc", "prep"], "somebody is about to read the newest");
+        assert_eq!(f.store.forget_exports().await.unwrap(), 1);
+        assert_eq!(left().await, ["prep"], "what belongs to a scan goes with the scan");
+        assert_eq!(f.store.forget_exports().await.unwrap(), 0);
     }
 }

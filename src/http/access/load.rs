@@ -40,7 +40,13 @@ pub(super) fn brings_work(method: &Method) -> bool {
 
 /// Fails if the queue is full or the disk nearly so.
 async fn has_room(api: &Api) -> Result<(), Problem> {
-    has_space(api)?;
+    if let Err(problem) = has_space(api) {
+        // What can be made again goes first: whoever tries again finds its room.
+        if let Err(error) = api.exports.give_way().await {
+            tracing::error!(%error, "merged clouds and pictures could not be given up");
+        }
+        return Err(problem);
+    }
     let most = api.access.load.open_jobs;
     if api.store.open_jobs(most).await? >= most {
         let detail = "the service has as many jobs waiting as it takes on";
