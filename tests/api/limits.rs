@@ -211,6 +211,25 @@ async fn a_full_disk_or_queue_stops_what_brings_work_and_nothing_else() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn an_upload_can_be_asked_after_and_taken_back_by_post_while_the_disk_is_full() {
+    let server = Server::start().await;
+    let project = server.project().await;
+    let announced = announce(&server, project.rsplit('/').next().unwrap(), None).await;
+    let upload = announced.headers()["location"].to_str().unwrap().to_owned();
+    let server =
+        server.restart_with(Settings { min_free_bytes: Some(u64::MAX), ..Settings::default() }).await;
+    let post = async |method: &str| {
+        let request = server.client.post(server.url(&upload)).header("tus-resumable", "1.0.0");
+        request.header("x-http-method-override", method).send().await.unwrap()
+    };
+    problem(post("PATCH").await, 503, "low-disk").await;
+    assert_eq!(post("HEAD").await.headers()["upload-offset"], "0");
+    assert_eq!(post("DELETE").await.status(), 204);
+    problem(server.get(&upload).await, 404, "not-found").await;
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn connections_that_dawdle_are_closed_and_do_not_keep_others_out() {
     let settings = Settings { idle_seconds: Some(1), max_connections: Some(3), ..Settings::default() };
     let server = Server::with(settings).await;

@@ -44,8 +44,13 @@ impl Server {
 
     /// Stops softly and starts again on the same data.
     pub async fn restart(self) -> Self {
+        self.restart_with(Settings::default()).await
+    }
+
+    /// Stops softly and starts again on the same data with some settings of its own.
+    pub async fn restart_with(self, settings: Settings) -> Self {
         self.running.stop().await;
-        Self::on(self.data, Settings::default()).await
+        Self::on(self.data, settings).await
     }
 
     /// Stops, makes every version look as if another engine had made it, and starts again.

@@ -9,6 +9,7 @@ use axum::http::{Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
+use crate::http::tus::meant;
 use crate::http::{Api, Problem};
 
 /// When no more work is taken on.
@@ -25,7 +26,7 @@ const RETRY_AFTER: Option<NonZeroU16> = NonZeroU16::new(30);
 
 /// Lets a request through unless it brings work that cannot be taken on now.
 pub(in crate::http) async fn shed(State(api): State<Api>, request: Request, next: Next) -> Response {
-    if brings_work(request.method())
+    if brings_work(&meant(&request))
         && let Err(problem) = has_room(&api).await
     {
         return problem.into_response();

@@ -21,6 +21,7 @@ use super::router::Api;
 
 pub use headers::parse_checksum;
 pub use metadata::{Metadata, parse_metadata};
+pub(super) use overridden::meant;
 
 /// The routes of the protocol.
 pub(super) fn routes() -> OpenApiRouter<Api> {

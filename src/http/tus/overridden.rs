@@ -1,8 +1,8 @@
 //! `POST /v1/uploads/{u}` with `X-HTTP-Method-Override`, for clients behind proxies that let only GET and POST pass.
 
 use axum::body::Body;
-use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode};
+use axum::extract::{MatchedPath, Request, State};
+use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 
 use super::append::continue_upload;
@@ -14,6 +14,17 @@ use crate::http::extract::Ids;
 use crate::http::problem::{Problem, Problems};
 use crate::http::router::Api;
 use crate::project::UploadId;
+
+/// The header that names the method.
+const OVERRIDE: &str = "x-http-method-override";
+
+/// The method that a request means: its own, unless it is a POST that stands for another.
+pub(in crate::http) fn meant(request: &Request) -> Method {
+    let template = request.extensions().get::<MatchedPath>().map(MatchedPath::as_str);
+    let stands = *request.method() == Method::POST && template == Some("/v1/uploads/{upload}");
+    let named = stands.then(|| text(request.headers(), OVERRIDE).ok().flatten()).flatten();
+    named.and_then(|name| name.parse().ok()).unwrap_or_else(|| request.method().clone())
+}
 
 /// Does what the method in `x-http-method-override` does, and answers as that does.
 #[utoipa::path(post, path = "/v1/uploads/{upload}", tag = "uploads", params(
@@ -47,7 +58,7 @@ pub(super) async fn post_upload(
     body: Body,
 ) -> Result<Response, Problem> {
     let (state, ids) = (State(api), Ids::<UploadId>(id));
-    match text(&headers, "x-http-method-override")?.unwrap_or("POST") {
+    match text(&headers, OVERRIDE)?.unwrap_or("POST") {
         "PATCH" => continue_upload(tus, state, ids, headers, body).await,
         "HEAD" => head_upload(tus, state, ids).await,
         "DELETE" => terminate_upload(tus, state, ids).await.map(IntoResponse::into_response),
