@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use cairn::config::Settings;
 use reqwest::{Body, RequestBuilder, Response};
 use serde_json::{Value, json};
 
@@ -110,6 +111,32 @@ async fn a_resumable_upload_that_is_announced_twice_is_one() {
     assert_eq!((first.status().as_u16(), replayed(&again)), (201, true));
     assert_eq!(first.headers()["location"], again.headers()["location"]);
     assert_eq!(again.headers()["tus-resumable"], "1.0.0");
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_refusal_for_want_of_room_is_not_given_again_when_there_is_room() {
+    let settings = Settings {
+        webhook_hosts: Some(vec!["127.0.0.1".to_owned()]),
+        webhook_networks: Some(vec!["127.0.0.0/8".to_owned()]),
+        ..Settings::default()
+    };
+    let server = Server::with(settings).await;
+    let path = format!("{}/webhooks", server.project().await);
+    let register = async |key: &str| {
+        let body = json!({ "url": "http://127.0.0.1:9/hook" });
+        post(&server, &path, key).json(&body).send().await.unwrap()
+    };
+    let mut last = String::new();
+    for i in 0..20 {
+        let made = register(&format!("key-{i}")).await;
+        assert_eq!(made.status(), 201);
+        last = made.headers()["location"].to_str().unwrap().to_owned();
+    }
+    problem(register("k").await, 409, "too-many-webhooks").await;
+    assert_eq!(server.client.delete(server.url(&last)).send().await.unwrap().status(), 204);
+    assert_eq!(register("k").await.status(), 201);
+    assert!(replayed(&register("k").await));
     server.stop().await;
 }
 

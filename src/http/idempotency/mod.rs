@@ -2,7 +2,8 @@
 //!
 //! The layer hashes the request while the handler reads it, and keeps the answer under the key for a day. A key that
 //! comes with another request is refused (422), one whose first request still runs as well (409). Not kept are failures
-//! of the service, refusals for want of room, and answers that were given before the whole request was read: then trying again is right.
+//! of the service, refusals for want of room and for what stands in the way just now (409), and answers that were given before the whole
+//! request was read: then trying again is right.
 //! A handler that changes rows has the answer kept in the same transaction ([`Once`]), so that no death of the process comes
 //! between the two; uploads know their content again instead. Uses [`crate::storage::KeptAnswer`].
 
@@ -102,13 +103,19 @@ async fn once(
     parts.extensions.insert(ticket.clone());
     let answer = next.run(Request::from_parts(parts, Body::new(body))).await;
     let Some(request) = hash.whole() else { return Ok(answer) };
-    if answer.status().is_server_error() || answer.status() == StatusCode::TOO_MANY_REQUESTS {
+    if passes(answer.status()) {
         return Ok(answer);
     }
     if ticket.is_sealed() && answer.status().is_success() {
         return Ok(answer);
     }
     keep(api, scope, key, request, answer).await
+}
+
+/// Whether the same request may be answered otherwise once something else has changed: the service is well again, there is room, or what
+/// stood in the way has gone.
+fn passes(status: StatusCode) -> bool {
+    status.is_server_error() || matches!(status, StatusCode::TOO_MANY_REQUESTS | StatusCode::CONFLICT)
 }
 
 /// Keeps an answer, and gives it.
