@@ -1,18 +1,15 @@
 //! The routes, the layers around them, and the OpenAPI description that is read off them.
 
-use std::any::Any;
 use std::sync::Arc;
 
 use axum::Router;
 use axum::extract::Request;
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{from_fn, from_fn_with_state};
-use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceBuilder;
 use tower::util::option_layer;
-use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::request_id::{MakeRequestId, PropagateRequestIdLayer, RequestId, SetRequestIdLayer};
 use tower_http::sensitive_headers::SetSensitiveRequestHeadersLayer;
 use tower_http::trace::TraceLayer;
@@ -124,15 +121,15 @@ pub fn openapi_yaml() -> Result<String, Problem> {
 pub fn router(api: Api) -> Router {
     let id = HeaderName::from_static("x-request-id");
     let layers = ServiceBuilder::new()
+        .map_request(without_id)
         .layer(SetRequestIdLayer::new(id.clone(), NewRequestId))
         // Whatever prints headers prints that there is a key, not which.
         .layer(SetSensitiveRequestHeadersLayer::new([header::AUTHORIZATION]))
         .layer(TraceLayer::new_for_http().make_span_with(span))
         .layer(PropagateRequestIdLayer::new(id))
-        .layer(from_fn(super::hang_up::hang_up))
-        .layer(CatchPanicLayer::custom(panicked));
+        .layer(from_fn(super::hang_up::hang_up));
     let (router, _) = routes().split_for_parts();
-    router
+    let router = router
         .route("/", get(page::index))
         .route("/web/{name}", get(page::asset))
         .fallback(|| async { Problem::not_found("there is nothing at this address") })
@@ -146,8 +143,8 @@ pub fn router(api: Api) -> Router {
         .layer(from_fn_with_state((api.clone(), Running::default()), idempotent))
         .layer(from_fn_with_state(api.clone(), access::shed))
         .layer(from_fn_with_state(api.clone(), access::guard))
-        .layer(from_fn_with_state(api.clone(), access::pace))
-        .layer(from_fn_with_state(api.clone(), metrics::observe))
+        .layer(from_fn_with_state(api.clone(), access::pace));
+    metrics::count(router, Arc::clone(&api.metrics), Arc::clone(&api.demand))
         .layer(option_layer(shield::cors(&api.access.origins)))
         .layer(from_fn(shield::harden))
         .with_state(api)
@@ -169,7 +166,8 @@ fn span(request: &Request) -> tracing::Span {
     tracing::info_span!("request", id, method = %request.method(), path = request.uri().path())
 }
 
-/// A handler panicked: the client learns only that.
-fn panicked(_: Box<dyn Any + Send + 'static>) -> Response {
-    Problem::internal("a handler panicked").into_response()
+/// An id of a request finds its lines in the log: nobody else chooses it.
+fn without_id(mut request: Request) -> Request {
+    request.headers_mut().remove("x-request-id");
+    request
 }

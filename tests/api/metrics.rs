@@ -13,6 +13,18 @@ fn value(text: &str, line: &str) -> Option<f64> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn the_id_of_a_request_is_the_services_own() {
+    let server = Server::start().await;
+    let id = async || {
+        let request = server.client.get(server.url("/healthz")).header("x-request-id", "theirs");
+        request.send().await.unwrap().headers()["x-request-id"].to_str().unwrap().to_owned()
+    };
+    let (first, next) = (id().await, id().await);
+    assert!(first != "theirs" && next != "theirs" && first != next, "{first} {next}");
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn metrics_tell_of_requests_refusals_uploads_jobs_and_what_there_is() {
     let server = Server::start().await;
     let project = server.project().await;

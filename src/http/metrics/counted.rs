@@ -1,20 +1,25 @@
 //! What has happened since the service started.
 
+use std::any::Any;
 use std::collections::BTreeSet;
+use std::sync::Arc;
 use std::time::Instant;
 
+use axum::Router;
 use axum::extract::{MatchedPath, Request, State};
 use axum::http::Method;
-use axum::middleware::Next;
-use axum::response::Response;
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::{IntoResponse, Response};
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Registry, Unit};
 use tokio::sync::Mutex;
+use tower_http::catch_panic::CatchPanicLayer;
 
+use crate::http::Problem;
 use crate::http::problem::Reason;
-use crate::http::router::Api;
+use crate::jobs::Demand;
 use crate::project::{JobId, Timestamp};
 use crate::storage::{StorageError, Store};
 
@@ -145,19 +150,37 @@ fn seconds(from: Timestamp, to: Timestamp) -> f64 {
     (to.0 - from.0).max(0) as f64 / 1000.0
 }
 
+/// Counts the requests to these routes, and how they are answered. A panic is an internal error, and counted as one.
+pub(in crate::http) fn count<S: Clone + Send + Sync + 'static>(
+    routes: Router<S>,
+    metrics: Arc<Metrics>,
+    demand: Arc<Demand>,
+) -> Router<S> {
+    routes.layer(CatchPanicLayer::custom(panicked)).layer(from_fn_with_state((metrics, demand), observe))
+}
+
+/// Something panicked: the client learns only that.
+fn panicked(_: Box<dyn Any + Send + 'static>) -> Response {
+    Problem::internal("a handler panicked").into_response()
+}
+
 /// Counts a request and how it was answered, under the template of its route: addresses are endless, routes are few.
-pub(in crate::http) async fn observe(State(api): State<Api>, request: Request, next: Next) -> Response {
+async fn observe(
+    State((metrics, demand)): State<(Arc<Metrics>, Arc<Demand>)>,
+    request: Request,
+    next: Next,
+) -> Response {
     let route = request.extensions().get::<MatchedPath>().map_or("none", MatchedPath::as_str).to_owned();
     let method = known(request.method()).to_owned();
     let begun = Instant::now();
-    api.demand.asked();
+    demand.asked();
     let response = next.run(request).await;
     let labels = [("method", method.clone()), ("route", route.clone())];
-    api.metrics.request_seconds.get_or_create(&labels).observe(begun.elapsed().as_secs_f64());
+    metrics.request_seconds.get_or_create(&labels).observe(begun.elapsed().as_secs_f64());
     let status = response.status().as_u16().to_string();
-    api.metrics.requests.get_or_create(&[("method", method), ("route", route), ("status", status)]).inc();
+    metrics.requests.get_or_create(&[("method", method), ("route", route), ("status", status)]).inc();
     if let Some(Reason(reason)) = response.extensions().get() {
-        api.metrics.rejections.get_or_create(&[("reason", reason.clone())]).inc();
+        metrics.rejections.get_or_create(&[("reason", reason.clone())]).inc();
     }
     response
 }
@@ -173,5 +196,39 @@ fn known(method: &Method) -> &str {
         | Method::DELETE
         | Method::OPTIONS => method.as_str(),
         _ => "other",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::body::Body;
+    use axum::routing::get;
+    use prometheus_client::encoding::text::encode_registry;
+    use tower::ServiceExt;
+
+    use super::*;
+
+    async fn broken() -> &'static str {
+        panic!("a handler that panics");
+    }
+
+    #[tokio::test]
+    async fn a_panic_is_answered_as_an_internal_error_and_counted_as_one() {
+        let metrics: Arc<Metrics> = Arc::default();
+        let app = count(
+            Router::new().route("/broken", get(broken)),
+            Arc::clone(&metrics),
+            Arc::new(Demand::new(0)),
+        );
+        let request = Request::get("/broken").body(Body::empty()).unwrap();
+        assert_eq!(app.oneshot(request).await.unwrap().status(), 500);
+        let mut text = String::new();
+        encode_registry(&mut text, metrics.registry()).unwrap();
+        for line in [
+            "cairn_http_requests_total{method=\"GET\",route=\"/broken\",status=\"500\"} 1",
+            "cairn_rejections_total{reason=\"internal-error\"} 1",
+        ] {
+            assert!(text.lines().any(|found| found == line), "{line} is not in\n{text}");
+        }
     }
 }

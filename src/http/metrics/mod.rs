@@ -15,7 +15,7 @@ use super::problem::{Problem, Problems};
 use super::router::Api;
 
 pub use counted::Metrics;
-pub(super) use counted::observe;
+pub(super) use counted::count;
 
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
