@@ -91,7 +91,7 @@ pub struct Settings {
     /// Proxies whose `X-Forwarded-For` is believed, such as 127.0.0.1 or 10.1.0.0/16, separated by commas [default: none]
     #[arg(long, env = "CAIRN_TRUSTED_PROXIES", value_name = "NETWORKS", value_delimiter = ',')]
     pub trusted_proxies: Option<Vec<String>>,
-    /// Seconds for which a connection may be silent between requests, take for the head of one, or not read an answer [default: 60]
+    /// Seconds for which a connection may be silent between requests, take for the head of one, or for the next kilobyte of an answer [default: 60]
     #[arg(long, env = "CAIRN_IDLE_SECONDS", value_name = "SECONDS")]
     pub idle_seconds: Option<u64>,
     /// Jobs of all projects that may wait or run; with more, work is refused with 503 [default: 100000]

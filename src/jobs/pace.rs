@@ -1,5 +1,5 @@
-//! Whether the bytes of a request come fast enough. A client that sends a byte a minute is as silent as one that sends none: both would
-//! hold a connection for ever. Used by all that read bodies of any length.
+//! Whether bytes come, or go, fast enough. A client that sends or takes a byte a minute is as silent as one that does nothing: both would
+//! hold a connection for ever. Used by all that read bodies of any length, and by connections for their answers.
 
 use std::time::Duration;
 
@@ -40,12 +40,12 @@ impl Pace {
     }
 
     /// How long the next piece may take.
-    fn left(&self) -> Duration {
+    pub(crate) fn left(&self) -> Duration {
         self.idle.saturating_sub(self.waited)
     }
 
     /// So many bytes came after so long.
-    fn note(&mut self, waited: Duration, came: usize) {
+    pub(crate) fn note(&mut self, waited: Duration, came: usize) {
         self.waited += waited;
         self.came += came;
         if self.came >= ENOUGH {

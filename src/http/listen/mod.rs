@@ -1,8 +1,8 @@
 //! From a listening socket to requests: connections are counted, may be encrypted, and end when they only wait.
 //!
 //! A stranger can hold a connection, so each costs little and none lasts: at most so many at once, fewer from one address, and one on which
-//! nothing moves for a while is closed, whether it is silent between requests, dribbles the head of one, or does not
-//! read the answer. Bodies have time-outs of their own where they are read. HTTP/1.1 only. `app` starts [`serve`].
+//! nothing moves for a while is closed, whether it is silent between requests, dribbles the head of one, or reads
+//! next to nothing of the answer. Bodies have time-outs of their own where they are read. HTTP/1.1 only. `app` starts [`serve`].
 
 mod patient;
 mod places;
@@ -41,7 +41,8 @@ pub struct ConnectionLimits {
     pub most: usize,
     /// At most so many from one address that is no trusted proxy; more are closed.
     pub most_per_address: usize,
-    /// How long one may only wait: for a request, for the rest of its head, or for the client to read the answer.
+    /// How long one may only wait: for a request, for the rest of its head, or for the client to read the next kilobyte of
+    /// the answer.
     pub idle: Duration,
 }
 
