@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::config::Config;
 use crate::http::{
-    self, Access, Api, Certificates, Entrance, Openness, Rates, TlsError, openapi_yaml, router,
+    self, Access, Api, Certificates, Entrance, Openness, Rates, Readings, TlsError, openapi_yaml, router,
 };
 use crate::jobs::webhooks::{Courier, SendError};
 use crate::jobs::{Compute, Demand, Exports, Intake, Resumable, Workers};
@@ -111,6 +111,7 @@ pub async fn start(config: Config) -> Result<Running, StartError> {
         resumable: Resumable::new(store.clone(), intake.clone(), config.upload_expiry, stop.clone()),
         intake,
         exports: Exports::new(store.clone(), compute.clone(), config.workers.max_points, config.exports),
+        readings: Readings::default(),
         access: Access {
             openness,
             origins: config.origins.into(),

@@ -9,7 +9,7 @@ use super::extract::Ids;
 use super::problem::{Problem, Problems};
 use super::query::Params;
 use super::router::Api;
-use crate::jobs::{CloudRequest, ComponentChoice};
+use crate::jobs::ComponentChoice;
 use crate::project::ProjectId;
 
 /// Downloads the merged cloud as binary PLY: the uploads, moved into the frame of their component. Coordinates are metres
@@ -41,9 +41,12 @@ pub(super) async fn get_cloud(
         text.trim().parse().ok().filter(|edge| (1e-5..=1e3).contains(edge))
     })?;
     query.finish()?;
-    let (version, content) = api.store.content(project, version).await?;
-    let blob = api.exports.cloud(project, &content, CloudRequest { component, voxel }).await?;
-    let file_name = format!("cloud-{version}.ply");
+    let reading = api.readings.read(&api.store, project, version).await?;
+    let file_name = format!("cloud-{}.ply", reading.version);
+    let part = api.exports.part(project, &reading.content, component).await?;
+    // To be made it may wait for others, and must not keep them from reading meanwhile.
+    drop(reading);
+    let blob = api.exports.cloud(part, voxel).await?;
     serve(&api.store, Download { blob, media_type: "model/ply", file_name }, &headers).await
 }
 

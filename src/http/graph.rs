@@ -5,7 +5,6 @@ use axum::response::Response;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::aside;
 use super::extract::Ids;
 use super::model::{ComponentBody, components};
 use super::open_join::{Names, OpenJoinBody, UndoneBody};
@@ -76,9 +75,9 @@ pub(super) async fn get_graph(
 ) -> Result<Response, Problem> {
     let version = query.version()?;
     query.finish()?;
-    let (version, content) = api.store.content(project, version).await?;
-    let names = Names::needed(&api.store, project, &content).await?;
-    aside::json(move || GraphBody::new(version, content, &names)).await
+    let reading = api.readings.read(&api.store, project, version).await?;
+    let names = Names::needed(&api.store, project, &reading.content).await?;
+    reading.json(move |version, content| GraphBody::new(version, content, &names)).await
 }
 
 impl GraphBody {

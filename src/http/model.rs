@@ -8,13 +8,13 @@ use serde::Serialize;
 use serde_json::Value;
 use utoipa::ToSchema;
 
-use super::aside;
 use super::download::none_match;
 use super::extract::Ids;
 use super::link::Link;
 use super::open_join::{Names, OpenJoinBody, UndoneBody};
 use super::problem::{Problem, Problems};
 use super::query::{Params, cursor};
+use super::reading::Reading;
 use super::router::Api;
 use super::scan::standing_body;
 use crate::project::{
@@ -177,13 +177,15 @@ pub(super) async fn get_model(
     Ids(project): Ids<ProjectId>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let (version, content) = api.store.content(project, None).await?;
-    let tag = format!("\"{project}-{version}\"");
-    let mut response = if none_match(&headers, &tag) {
-        StatusCode::NOT_MODIFIED.into_response()
+    let tag = |version| format!("\"{project}-{version}\"");
+    // Most who ask again have it, and for them it need not be read.
+    let head = api.store.project(project).await?.head;
+    let (mut response, tag) = if none_match(&headers, &tag(head)) {
+        (StatusCode::NOT_MODIFIED.into_response(), tag(head))
     } else {
-        let names = Names::needed(&api.store, project, &content).await?;
-        aside::json(move || ModelBody::new(project, version, content, &names)).await?
+        let reading = api.readings.read(&api.store, project, None).await?;
+        let tag = tag(reading.version);
+        (model(&api, project, reading).await?, tag)
     };
     response.headers_mut().insert(header::ETAG, HeaderValue::from_str(&tag).map_err(Problem::internal)?);
     Ok(response)
@@ -218,7 +220,12 @@ pub(super) async fn get_version(
     State(api): State<Api>,
     Ids((project, version)): Ids<(ProjectId, u32)>,
 ) -> Result<Response, Problem> {
-    let (version, content) = api.store.content(project, Some(VersionNumber(version))).await?;
-    let names = Names::needed(&api.store, project, &content).await?;
-    aside::json(move || ModelBody::new(project, version, content, &names)).await
+    let reading = api.readings.read(&api.store, project, Some(VersionNumber(version))).await?;
+    model(&api, project, reading).await
+}
+
+/// The answer that shows a version.
+async fn model(api: &Api, project: ProjectId, reading: Reading) -> Result<Response, Problem> {
+    let names = Names::needed(&api.store, project, &reading.content).await?;
+    reading.json(move |version, content| ModelBody::new(project, version, content, &names)).await
 }

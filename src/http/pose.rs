@@ -18,6 +18,7 @@ use super::aside::aside;
 use super::extract::Ids;
 use super::problem::{Problem, Problems};
 use super::query::Params;
+use super::reading::Reading;
 use super::router::Api;
 use crate::geometry::Pose;
 use crate::geometry::pose_text::{LogEntry, to_kitti, to_log, to_tum};
@@ -96,20 +97,20 @@ pub(super) async fn get_poses(
     let version = query.version()?;
     let component = query.value("component", "the index of a component")?;
     query.finish()?;
-    let (version, content) = api.store.content(project, version).await?;
+    let reading = api.readings.read(&api.store, project, version).await?;
     let names = api.store.names_ever(project).await?;
-    aside(move || poses(form, version, &content, component, names)).await?
+    aside(move || poses(form, &reading, component, names)).await?
 }
 
 /// The answer with the poses of a version.
 fn poses(
     form: Form,
-    version: VersionNumber,
-    content: &ModelContent,
+    reading: &Reading,
     component: Option<usize>,
     names: Vec<(ScanId, Name)>,
 ) -> Result<Response, Problem> {
-    let scans = named(content, component, names);
+    let version = reading.version;
+    let scans = named(&reading.content, component, names);
     let of = |component: usize| {
         scans.iter().filter_map(move |s| {
             let (c, pose) = s.place?;

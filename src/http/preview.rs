@@ -34,8 +34,11 @@ pub(super) async fn get_preview(
     let version = query.version()?;
     let component = component(&mut query)?;
     query.finish()?;
-    let (version, content) = api.store.content(project, version).await?;
-    let blob = api.exports.preview(project, &content, component).await?;
-    let file_name = format!("preview-{version}.png");
+    let reading = api.readings.read(&api.store, project, version).await?;
+    let file_name = format!("preview-{}.png", reading.version);
+    let part = api.exports.part(project, &reading.content, component).await?;
+    // To be made it may wait for others, and must not keep them from reading meanwhile.
+    drop(reading);
+    let blob = api.exports.preview(part).await?;
     serve(&api.store, Download { blob, media_type: "image/png", file_name }, &headers).await
 }

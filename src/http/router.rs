@@ -20,8 +20,8 @@ use utoipa_axum::routes;
 
 use super::idempotency::{self, Running, idempotent};
 use super::{
-    Access, Metrics, Problem, Readiness, access, cloud, decision, events, graph, health, job, metrics, model,
-    page, pose, preview, project, scan, shield, tus, upload, webhook,
+    Access, Metrics, Problem, Readiness, Readings, access, cloud, decision, events, graph, health, job,
+    metrics, model, page, pose, preview, project, scan, shield, tus, upload, webhook,
 };
 use crate::jobs::webhooks::Targets;
 use crate::jobs::{Demand, Exports, Intake, Resumable};
@@ -38,6 +38,8 @@ pub struct Api {
     pub resumable: Resumable,
     /// Makes files for download.
     pub exports: Exports,
+    /// Reads versions, few at a time.
+    pub readings: Readings,
     /// Who is let in.
     pub access: Access,
     /// Whom webhooks may reach.

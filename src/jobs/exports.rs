@@ -25,13 +25,11 @@ pub enum ComponentChoice {
     All,
 }
 
-/// A cloud to be made.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CloudRequest {
-    /// Of which part.
-    pub component: ComponentChoice,
-    /// One point for each occupied cube of this edge, metres; `None`: every point.
-    pub voxel: Option<f64>,
+/// The scans of a part of a model, with their poses: what an export is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    project: ProjectId,
+    placed: Vec<(Scan, Placement)>,
 }
 
 /// Why a file cannot be made.
@@ -127,34 +125,25 @@ impl Exports {
         Ok(())
     }
 
-    /// The merged cloud of a version as binary PLY, in metres, in the frame of its component.
-    pub async fn cloud(
-        &self,
-        project: ProjectId,
-        content: &ModelContent,
-        request: CloudRequest,
-    ) -> Result<StoredBlob, ExportError> {
-        let placed = self.placed(project, content, request.component).await?;
-        let key = key(&format!("cloud {:?}", request.voxel), &placed);
-        let blobs = self.store.blobs.clone();
-        let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
-        let disk = self.disk.clone();
-        self.made(project, key, move || blobs.put_with(|file| write_ply(file, &merge, request.voxel, &disk)))
-            .await
+    /// The merged cloud of a part as binary PLY, in metres, in the frame of its component: one point for each occupied cube of the edge
+    /// `voxel`, metres, or every point.
+    pub async fn cloud(&self, part: Part, voxel: Option<f64>) -> Result<StoredBlob, ExportError> {
+        let key = key(&format!("cloud {voxel:?}"), &part.placed);
+        let (project, merge) = (part.project, self.merge(part));
+        let (blobs, disk) = (self.store.blobs.clone(), self.disk.clone());
+        self.made(project, key, move || blobs.put_with(|file| write_ply(file, &merge, voxel, &disk))).await
     }
 
-    /// A picture of a version: PNG, the component from above and from the side.
-    pub async fn preview(
-        &self,
-        project: ProjectId,
-        content: &ModelContent,
-        component: ComponentChoice,
-    ) -> Result<StoredBlob, ExportError> {
-        let placed = self.placed(project, content, component).await?;
-        let key = key("preview", &placed);
+    /// A picture of a part: PNG, from above and from the side.
+    pub async fn preview(&self, part: Part) -> Result<StoredBlob, ExportError> {
+        let key = key("preview", &part.placed);
+        let (project, merge) = (part.project, self.merge(part));
         let blobs = self.store.blobs.clone();
-        let merge = Merge { blobs: blobs.clone(), placed, max_points: self.max_points };
         self.made(project, key, move || Ok(blobs.put(&draw(&merge)?)?)).await
+    }
+
+    fn merge(&self, part: Part) -> Merge {
+        Merge { blobs: self.store.blobs.clone(), placed: part.placed, max_points: self.max_points }
     }
 
     /// The remembered file, or the one that `make` makes.
@@ -201,13 +190,13 @@ impl Exports {
         }
     }
 
-    /// The scans that take part, in order of arrival. Deleted ones do not: their uploads are gone.
-    async fn placed(
+    /// The scans of a version that take part, in order of arrival. Deleted ones do not: their uploads are gone.
+    pub async fn part(
         &self,
         project: ProjectId,
         content: &ModelContent,
         component: ComponentChoice,
-    ) -> Result<Vec<(Scan, Placement)>, ExportError> {
+    ) -> Result<Part, ExportError> {
         let component = match component {
             ComponentChoice::One(index) => Some(index),
             ComponentChoice::All => None,
@@ -219,7 +208,7 @@ impl Exports {
             .filter(|(_, deleted)| !deleted)
             .filter_map(|(scan, _)| places.remove(&scan.id).map(|place| (scan, place.clone())))
             .collect();
-        if placed.is_empty() { Err(ExportError::NothingThere) } else { Ok(placed) }
+        if placed.is_empty() { Err(ExportError::NothingThere) } else { Ok(Part { project, placed }) }
     }
 }
 

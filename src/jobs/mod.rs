@@ -43,7 +43,7 @@ pub use compute::{Compute, Panicked};
 pub use demand::{Connected, Demand};
 pub use digest::{DigestAlgorithm, DigestMismatch, ExpectedDigest};
 pub use error::JobError;
-pub use exports::{CloudRequest, ComponentChoice, ExportError, ExportLimits, Exports};
+pub use exports::{ComponentChoice, ExportError, ExportLimits, Exports, Part};
 pub use intake::{Intake, IntakeError, IntakeLimits, UploadRequest};
 pub use isolated::{Isolated, Isolation, NOT_NOW, Order, Report, work_for_service};
 pub(crate) use pace::Pace;
