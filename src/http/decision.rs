@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use utoipa::ToSchema;
 
+use super::access::Caller;
 use super::extract::{Body, Ids};
 use super::idempotency::{Once, Reply};
 use super::job::JobBody;
@@ -121,6 +122,7 @@ impl DecisionBody {
 pub(super) async fn create_decision(
     State(api): State<Api>,
     Ids(project): Ids<ProjectId>,
+    caller: Caller,
     once: Once,
     Body(new): Body<NewDecision>,
 ) -> Result<Reply, Problem> {
@@ -131,11 +133,12 @@ pub(super) async fn create_decision(
         let body = DecidedBody { decision: DecisionBody::new(project, kept), job: job.clone().into() };
         Reply::made(StatusCode::ACCEPTED, location, &[(header::RETRY_AFTER, "1")]).json(&body)
     };
-    let done = api.store.decide(project, &decision, once.seal(answer)).await.map_err(|e| match e {
-        // Whoever names a scan in a body is told which field names it.
-        StorageError::NoScan(id) => Problem::invalid(field_of(&decision, id), e.to_string()),
-        other => other.into(),
-    })?;
+    let done =
+        api.store.decide(project, &decision, caller.key(), once.seal(answer)).await.map_err(|e| match e {
+            // Whoever names a scan in a body is told which field names it.
+            StorageError::NoScan(id) => Problem::invalid(field_of(&decision, id), e.to_string()),
+            other => other.into(),
+        })?;
     answer(&done)
 }
 
@@ -181,8 +184,9 @@ pub(super) async fn get_decision(
 pub(super) async fn delete_decision(
     State(api): State<Api>,
     Ids((project, decision)): Ids<(ProjectId, DecisionId)>,
+    caller: Caller,
 ) -> Result<impl IntoResponse, Problem> {
-    let job = api.store.take_decision_back(project, decision).await?;
+    let job = api.store.take_decision_back(project, decision, caller.key()).await?;
     let location = format!("/v1/jobs/{}", job.id);
     Ok((
         StatusCode::ACCEPTED,
