@@ -269,7 +269,8 @@ impl Store {
         let mut tx = self.begin().await?;
         check(&mut tx, lease).await?;
         sqlx::query(
-            "UPDATE jobs SET lane = 'map', worker = NULL, lease_ms = NULL, tries = 0, losses = 0, crashes = 0, stage = 'queued',
+            "UPDATE jobs SET lane = 'map', worker = NULL, lease_ms = NULL, tries = 0, waits = 0, losses = 0, crashes = 0,
+               stage = 'queued',
                updated_ms = ?, revision = revision + 1 WHERE id = ?",
         )
         .bind(now.0)

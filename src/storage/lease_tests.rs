@@ -20,6 +20,13 @@ impl Fixture {
         self.store.admit_scan(&new).await.unwrap()
     }
 
+    /// Makes the wait between attempts pass: it is not what is tested here.
+    async fn waited(&self) {
+        let mut tx = self.store.begin().await.unwrap();
+        sqlx::query("UPDATE jobs SET not_before_ms = 0").execute(&mut *tx).await.unwrap();
+        tx.commit().await.unwrap();
+    }
+
     async fn claim(&self, lane: Lane) -> Option<Claim> {
         self.store.claim(lane, "worker", LONG, 10, false).await.unwrap()
     }
@@ -202,10 +209,7 @@ async fn a_job_whose_workers_die_again_and_again_fails_and_says_so() {
     let job = f.scan(1).await.job.id;
     for _ in 0..8 {
         assert!(!f.store.job(job).await.unwrap().state.is_final());
-        // The wait between retries is not what is tested here.
-        let mut tx = f.store.begin().await.unwrap();
-        sqlx::query("UPDATE jobs SET not_before_ms = 0").execute(&mut *tx).await.unwrap();
-        tx.commit().await.unwrap();
+        f.waited().await;
         f.claim(Lane::Ingest).await.unwrap();
         f.store.reclaim(true, false).await.unwrap();
     }
@@ -287,9 +291,7 @@ async fn only_the_death_of_its_own_process_counts_against_a_job_that_has_one() {
     assert_eq!(f.store.held(bad, both.lease.attempt).await.unwrap(), (Lane::Map, both.clone()));
     f.store.crashed(&both.lease, &fault).await.unwrap();
     for _ in 0..2 {
-        let mut tx = f.store.begin().await.unwrap();
-        sqlx::query("UPDATE jobs SET not_before_ms = 0").execute(&mut *tx).await.unwrap();
-        tx.commit().await.unwrap();
+        f.waited().await;
         let alone = f.store.claim(Lane::Map, "worker", LONG, 10, true).await.unwrap().unwrap();
         assert_eq!((alone.job.id, alone.members.len()), (bad, 0), "a batch that crashed is tried one by one");
         f.store.crashed(&alone.lease, &fault).await.unwrap();
@@ -300,16 +302,34 @@ async fn only_the_death_of_its_own_process_counts_against_a_job_that_has_one() {
 }
 
 #[tokio::test]
-async fn what_is_not_the_jobs_doing_never_ends_it() {
+async fn what_is_not_the_jobs_doing_uses_up_no_attempt() {
     let f = Fixture::new().await;
     let job = f.scan(1).await.job.id;
     let fault = Fault { code: "storage".to_owned(), detail: "for the test".to_owned() };
-    for _ in 0..10 {
-        let mut tx = f.store.begin().await.unwrap();
-        sqlx::query("UPDATE jobs SET not_before_ms = 0").execute(&mut *tx).await.unwrap();
-        tx.commit().await.unwrap();
+    let mut attempts = 0;
+    for round in 0..12 {
+        f.waited().await;
         let claim = f.claim(Lane::Ingest).await.unwrap();
-        f.store.fail(&claim.lease, &fault, Retry::UntilItPasses).await.unwrap();
+        let retry = if round % 5 == 4 { Retry::AFewTimes } else { Retry::UntilItPasses };
+        attempts += u32::from(retry == Retry::AFewTimes);
+        f.store.fail(&claim.lease, &fault, retry).await.unwrap();
     }
-    assert_eq!(f.store.job(job).await.unwrap().state, JobState::Running);
+    assert_eq!((attempts, f.store.job(job).await.unwrap().state), (2, JobState::Running));
+    f.waited().await;
+    let claim = f.claim(Lane::Ingest).await.unwrap();
+    f.store.fail(&claim.lease, &fault, Retry::AFewTimes).await.unwrap();
+    assert_eq!(f.store.job(job).await.unwrap().state, JobState::Failed);
+}
+
+#[tokio::test]
+async fn a_batch_that_meets_a_full_disk_waits_and_stays_together() {
+    let f = Fixture::new().await;
+    f.ingested(1).await;
+    f.ingested(2).await;
+    let fault = Fault { code: "storage".to_owned(), detail: "for the test".to_owned() };
+    let both = f.claim(Lane::Map).await.unwrap();
+    f.store.fail(&both.lease, &fault, Retry::UntilItPasses).await.unwrap();
+    assert!(f.claim(Lane::Map).await.is_none(), "both wait");
+    f.waited().await;
+    assert_eq!(f.claim(Lane::Map).await.unwrap().lease.members, both.lease.members);
 }

@@ -35,14 +35,13 @@ fn backoff(n: i64) -> Duration {
 
 impl Store {
     /// Ends a job with a fault. If it may pass, the job goes back to its queue first, and members of its batch go back at once, each
-    /// to be tried alone.
+    /// to be tried alone. What is not their doing counts against none of them: they wait together.
     pub async fn fail(&self, lease: &Lease, fault: &Fault, retry: Retry) -> Result<(), StorageError> {
-        let most = match retry {
-            Retry::Never => 0,
-            Retry::AFewTimes => MAX_TRIES,
-            Retry::UntilItPasses => i64::MAX,
-        };
-        self.set_back(lease, fault, "tries", most).await
+        match retry {
+            Retry::Never => self.set_back(lease, fault, "tries", 0).await,
+            Retry::AFewTimes => self.set_back(lease, fault, "tries", MAX_TRIES).await,
+            Retry::UntilItPasses => self.put_off(lease).await,
+        }
     }
 
     /// The process that did nothing but this job has died, or did not end in time. A batch is tried again one by one; a job that was
@@ -63,6 +62,27 @@ impl Store {
                 .await?;
         }
         tx.commit().await?;
+        Ok(())
+    }
+
+    /// Gives a claim back until what is in its way may have passed, ever later.
+    async fn put_off(&self, lease: &Lease) -> Result<(), StorageError> {
+        let now = Timestamp::now();
+        let mut tx = self.begin().await?;
+        check(&mut tx, lease).await?;
+        free(&mut tx, lease).await?;
+        let row = sqlx::query("SELECT waits FROM jobs WHERE id = ?").bind(lease.job.to_string());
+        let until = now.plus(backoff(row.fetch_one(&mut *tx).await?.try_get::<i64, _>("waits")? + 1));
+        for id in lease.all() {
+            sqlx::query("UPDATE jobs SET waits = waits + 1, not_before_ms = ? WHERE id = ?")
+                .bind(until.0)
+                .bind(id.to_string())
+                .execute(&mut *tx)
+                .await?;
+        }
+        tx.commit().await?;
+        self.announce(lease.all());
+        self.ring();
         Ok(())
     }
 
