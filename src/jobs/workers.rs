@@ -11,7 +11,7 @@ use super::isolated::{Isolated, Isolation};
 use super::perform::{PATIENCE, Performer};
 use super::{Compute, Demand};
 use crate::project::Lane;
-use crate::storage::{Claim, StorageError, Store};
+use crate::storage::{Claim, Overdue, StorageError, Store};
 
 /// How the pool works.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -65,7 +65,7 @@ impl Workers {
         options: WorkerOptions,
         demand: Arc<Demand>,
     ) -> Result<Self, StorageError> {
-        let left = store.reclaim(true, isolates(&options)).await?;
+        let left = store.reclaim(isolates(&options)).await?;
         if left > 0 {
             tracing::info!(jobs = left, "jobs of a process that ended are taken up again");
         }
@@ -151,20 +151,33 @@ impl Pool {
         }
     }
 
-    /// Takes back claims whose lease ran out.
+    /// Takes back claims whose lease ran out and that are not renewed until the next look either. Who works renews every third of the
+    /// lease, so whoever could not, because the machine slept, its clock was set or the database took nothing, has done so by then.
     async fn sweep(&self) {
         let mut tick = tokio::time::interval(self.0.options.lease / 2);
+        let mut silent = Vec::new();
         loop {
             tokio::select! {
                 _ = tick.tick() => {}
                 () = self.0.stop.cancelled() => return,
             }
-            match self.0.store.reclaim(false, isolates(&self.0.options)).await {
-                Ok(0) => {}
-                Ok(jobs) => tracing::warn!(jobs, "leases ran out; the jobs are queued again"),
-                Err(error) => tracing::error!(%error, "leases cannot be checked"),
+            match self.look_after_leases(&silent).await {
+                Ok(overdue) => silent = overdue,
+                Err(error) => {
+                    tracing::error!(%error, "leases cannot be checked");
+                    silent.clear();
+                }
             }
         }
+    }
+
+    /// Takes back the claims that were overdue at the last look and still are; returns those that are overdue now.
+    async fn look_after_leases(&self, silent: &[Overdue]) -> Result<Vec<Overdue>, StorageError> {
+        let jobs = self.0.store.reclaim_silent(silent, isolates(&self.0.options)).await?;
+        if jobs > 0 {
+            tracing::warn!(jobs, "leases ran out; the jobs are queued again");
+        }
+        self.0.store.overdue().await
     }
 
     /// Deletes files that nothing needs any more, sees to damaged ones, and ends processes that wait for nothing, from time to time: nobody

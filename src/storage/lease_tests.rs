@@ -64,7 +64,8 @@ async fn a_job_is_held_once_and_after_its_lease_by_another_who_fences_the_first(
     let first = f.store.claim(Lane::Ingest, "a", Duration::ZERO, 1, false).await.unwrap().unwrap();
     assert!(f.claim(Lane::Ingest).await.is_none(), "it is held");
     tokio::time::sleep(Duration::from_millis(5)).await;
-    assert_eq!(f.store.reclaim(false, false).await.unwrap(), 1);
+    let overdue = f.store.overdue().await.unwrap();
+    assert_eq!(f.store.reclaim_silent(&overdue, false).await.unwrap(), 1);
     let second = f.claim(Lane::Ingest).await.unwrap();
     assert_eq!(second.lease.attempt, first.lease.attempt + 1);
     for result in
@@ -211,7 +212,7 @@ async fn a_job_whose_workers_die_again_and_again_fails_and_says_so() {
         assert!(!f.store.job(job).await.unwrap().state.is_final());
         f.waited().await;
         f.claim(Lane::Ingest).await.unwrap();
-        f.store.reclaim(true, false).await.unwrap();
+        f.store.reclaim(false).await.unwrap();
     }
     assert_eq!(f.store.job(job).await.unwrap().state, JobState::Failed);
     assert_eq!(f.store.job(job).await.unwrap().fault.unwrap().code, "worker-lost");
@@ -283,7 +284,7 @@ async fn only_the_death_of_its_own_process_counts_against_a_job_that_has_one() {
     for _ in 0..20 {
         let claim = f.store.claim(Lane::Map, "worker", LONG, 10, true).await.unwrap().unwrap();
         assert_eq!(claim.members.len(), 1, "suspects go together where they can do no harm");
-        f.store.reclaim(true, true).await.unwrap();
+        f.store.reclaim(true).await.unwrap();
     }
     let fault = Fault { code: "worker-lost".to_owned(), detail: "for the test".to_owned() };
     let both = f.store.claim(Lane::Map, "worker", LONG, 10, true).await.unwrap().unwrap();
@@ -332,4 +333,38 @@ async fn a_batch_that_meets_a_full_disk_waits_and_stays_together() {
     assert!(f.claim(Lane::Map).await.is_none(), "both wait");
     f.waited().await;
     assert_eq!(f.claim(Lane::Map).await.unwrap().lease.members, both.lease.members);
+}
+
+#[tokio::test]
+async fn a_job_whose_process_falls_silent_again_and_again_is_set_aside() {
+    let f = Fixture::new().await;
+    let (bad, good) = (f.ingested(1).await.job.id, f.ingested(2).await.job.id);
+    let mut together = Vec::new();
+    while !f.store.job(bad).await.unwrap().state.is_final() {
+        f.waited().await;
+        let claim = f.store.claim(Lane::Map, "worker", Duration::ZERO, 10, true).await.unwrap().unwrap();
+        assert_eq!(claim.job.id, bad);
+        assert_eq!(claim.suspect, !together.is_empty());
+        together.push(1 + claim.members.len());
+        tokio::time::sleep(Duration::from_millis(5)).await;
+        let overdue = f.store.overdue().await.unwrap();
+        assert_eq!(f.store.reclaim_silent(&overdue, true).await.unwrap(), together[together.len() - 1]);
+    }
+    assert_eq!(together, [2, 1, 1], "first its batch, then it alone");
+    assert_eq!(f.store.job(bad).await.unwrap().fault.unwrap().code, "worker-lost");
+    f.waited().await;
+    assert_eq!(f.claim(Lane::Map).await.unwrap().job.id, good);
+}
+
+#[tokio::test]
+async fn a_claim_that_is_renewed_between_two_looks_is_left_alone() {
+    let f = Fixture::new().await;
+    f.scan(1).await;
+    let late = f.store.claim(Lane::Ingest, "worker", Duration::ZERO, 1, true).await.unwrap().unwrap();
+    tokio::time::sleep(Duration::from_millis(5)).await;
+    let overdue = f.store.overdue().await.unwrap();
+    assert_eq!(overdue.len(), 1);
+    f.store.renew(&late.lease, LONG, None, 0).await.unwrap();
+    assert_eq!(f.store.reclaim_silent(&overdue, true).await.unwrap(), 0);
+    f.store.finish_ingest(&late.lease).await.unwrap();
 }

@@ -61,7 +61,7 @@ pub use publication::{NewVersion, Publication, ScanChange};
 pub use quotas::{Holder, Quota};
 pub use references::{Reference, Role};
 pub use scans::{Admission, NewScan};
-pub use setbacks::Retry;
+pub use setbacks::{Overdue, Retry};
 pub use store::{Page, Store};
 pub use thinning::KEPT_WHOLE;
 pub use upload_files::{UploadFile, UploadFiles};

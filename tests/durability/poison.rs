@@ -1,10 +1,13 @@
 //! Scans whose work kills or hangs the process that does it: they are set aside and say why, and their project goes on.
 
+use std::collections::BTreeSet;
+
 use serde_json::Value;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{Connection as _, Row as _, SqliteConnection};
 
-use crate::process::{Faults, Process, room};
+use crate::process::{Faults, Process, room, until};
+use crate::resident::{lives, workers};
 
 fn failed(job: &Value, code: &str) {
     assert_eq!(job["status"], "failed", "{job}");
@@ -82,5 +85,32 @@ async fn a_job_that_takes_ever_more_memory_fails_and_nobody_else_does() {
         assert_eq!(service.ended(&upload["job"]).await["status"], "succeeded");
     }
     failed(&service.ended(&greedy["job"]).await, "memory-limit");
+    assert!(!service.has_died());
+}
+
+#[tokio::test]
+async fn a_scan_at_which_every_process_falls_silent_is_set_aside() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("data"), Faults::new(dir.path()));
+    let mut service = Process::with(&data, &["--lease-seconds", "1"], Some(&faults));
+    let project = service.project().await;
+    let silent = room(7.0);
+    faults.set(&format!("open loop 0 {}", blake3::hash(&silent).to_hex()));
+    let silent = service.accepted(&project, silent).await;
+    let job = format!("/v1/jobs/{}", silent["job"]["id"].as_str().unwrap());
+    let mut stopped = BTreeSet::new();
+    while service.json(&job).await["finished"].is_null() {
+        for process in workers(&service) {
+            // One that has ended meanwhile cannot be stopped.
+            let _ = std::process::Command::new("kill").arg("-STOP").arg(process.to_string()).output();
+            stopped.insert(process);
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    failed(&service.ended(&silent["job"]).await, "worker-lost");
+    until("those that fell silent are ended", || stopped.iter().all(|process| !lives(*process))).await;
+    faults.set("");
+    let good = service.accepted(&project, room(0.0)).await;
+    assert_eq!(service.ended(&good["job"]).await["status"], "succeeded");
     assert!(!service.has_died());
 }

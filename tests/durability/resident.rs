@@ -8,7 +8,7 @@ use std::path::Path;
 use crate::process::{Faults, Process, room, until};
 
 /// Processes that the service has started and that have not ended.
-fn workers(service: &Process) -> BTreeSet<u32> {
+pub fn workers(service: &Process) -> BTreeSet<u32> {
     let tasks = fs::read_dir(format!("/proc/{}/task", service.id())).unwrap();
     let children = tasks.filter_map(|task| fs::read_to_string(task.ok()?.path().join("children")).ok());
     children
@@ -17,7 +17,7 @@ fn workers(service: &Process) -> BTreeSet<u32> {
 }
 
 /// Whether a process computes or waits; one that has ended may still have an entry.
-fn lives(process: u32) -> bool {
+pub fn lives(process: u32) -> bool {
     let at = Path::new("/proc").join(process.to_string()).join("cmdline");
     fs::read(at).is_ok_and(|command| !command.is_empty())
 }
