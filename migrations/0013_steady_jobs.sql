@@ -1,2 +1,5 @@
 -- Attempts are what a job is to blame for; how often it waited for disk or database is counted apart, and only makes it wait longer.
 ALTER TABLE jobs ADD COLUMN waits INTEGER NOT NULL DEFAULT 0;
+
+-- Scans that were deleted and that the model may still hold.
+CREATE INDEX scans_to_be_forgotten ON scans (project_id) WHERE deleted_ms IS NOT NULL AND forgotten_ms IS NULL;

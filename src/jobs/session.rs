@@ -19,8 +19,8 @@ use crate::features::PreparedScan;
 use crate::mapping::{Decision, LiveModel, MappingOptions, ModelSnapshot};
 use crate::pairwise::PairResult;
 use crate::project::{
-    ContentKey, Fault, JobId, KeptDecision, ModelContent, Project, ProjectId, Scan, ScanId, Standing,
-    VersionNumber,
+    ContentKey, Fault, JobId, KeptDecision, ModelContent, Project, ProjectId, Scan, ScanId, ScanState,
+    Standing, VersionNumber,
 };
 use crate::storage::{BlobId, Claim, NewVersion, Publication, Retry, ScanChange, Store, pack};
 
@@ -63,12 +63,14 @@ pub(super) struct Session {
     decisions: Vec<Decision>,
     /// Scans that cannot take part after all, found on the way.
     pub unfit: Vec<(ScanId, Fault)>,
+    /// Deleted scans that the model holds no more once this is published.
+    pub forgotten: Vec<ScanId>,
 }
 
 impl Session {
-    /// Opens the newest version of a project's model.
-    pub async fn open(task: &Task, project: ProjectId) -> Result<Self, JobError> {
-        let project = task.store.project(project).await?;
+    /// Opens the newest version of a project's model. Deleted scans whose removals failed are left out of it.
+    pub async fn open(task: &Task, id: ProjectId) -> Result<Self, JobError> {
+        let project = task.store.project(id).await?;
         let parameters = Parameters::choose(&task.store, &project).await?;
         let kept = task.store.all_decisions(project.id).await?;
         let decisions = if kept.is_empty() {
@@ -85,6 +87,7 @@ impl Session {
             kept,
             decisions,
             unfit: Vec::new(),
+            forgotten: task.store.undone_removals(id).await?,
         };
         if session.project.head == VersionNumber::EMPTY {
             return Ok(session);
@@ -114,7 +117,23 @@ impl Session {
                 other => other?,
             }
         }
+        session.leave_out_forgotten(task).await?;
         Ok(session)
+    }
+
+    /// Takes what is to be forgotten out of the model.
+    async fn leave_out_forgotten(&mut self, task: &Task) -> Result<(), JobError> {
+        if self.forgotten.is_empty() {
+            return Ok(());
+        }
+        let all = task.store.scans_ever(self.project.id).await?;
+        for (scan, _) in &all {
+            if self.forgotten.contains(&scan.id) {
+                tracing::warn!(scan = %scan.id, "a scan is taken out of the model whose removal had failed");
+                self.remove(scan, &all);
+            }
+        }
+        Ok(())
     }
 
     /// Reads the newest version as readers see it. If that is damaged, the rows of its scans tell enough to go on, and a new version
@@ -173,7 +192,10 @@ impl Session {
     ) -> Result<(), JobError> {
         let by_key = scans_by_key(task, self.project.id).await?;
         let known: HashMap<ScanId, &Scan> = by_key.values().map(|s| (s.id, s)).collect();
-        let old = self.before.scans.iter().filter(|(_, s)| !matches!(s, Standing::Failed(_)));
+        let takes_part = |(id, standing): &&(ScanId, Standing)| {
+            !matches!(standing, Standing::Failed(_)) && !self.forgotten.contains(id)
+        };
+        let old = self.before.scans.iter().filter(takes_part);
         let mut all: Vec<Scan> = old.filter_map(|(id, _)| known.get(id).map(|s| (*s).clone())).collect();
         all.extend(more);
         self.parameters = parameters;
@@ -259,6 +281,7 @@ impl Session {
             pairs,
             engine: parameters.engine(),
             scans: changes(&self.before, content, &self.unfit),
+            forgotten: self.forgotten,
             outcomes: task.claim.lease.all().map(|job| (job, outcome(content, number, job))).collect(),
         };
         task.store.publish(&task.claim.lease, &publication).await?;
@@ -278,9 +301,12 @@ impl Session {
         self.parameters.mapping_options(&self.decisions)
     }
 
-    /// Takes a scan out of the model. Returns whether it was there.
-    pub fn remove(&mut self, scan: ContentKey) -> bool {
-        self.model.remove(scan_key(scan))
+    /// Takes a deleted scan out of the model, unless its content came again and is in the model as another of the project's scans,
+    /// which are `all`, each with whether it was deleted. Returns whether it was there.
+    pub fn remove(&mut self, scan: &Scan, all: &[(Scan, bool)]) -> bool {
+        let in_model = |state| matches!(state, ScanState::Registered | ScanState::Waiting);
+        let again = all.iter().any(|(other, gone)| !gone && other.key == scan.key && in_model(other.state));
+        !again && self.model.remove(scan_key(scan.key))
     }
 }
 

@@ -40,7 +40,8 @@ pub struct WorkerOptions {
     pub grace: Duration,
 }
 
-/// How often the folder of blobs is walked for files that nothing names; the first time at the start.
+/// How often the folder of blobs is walked for files that nothing names, and deletions whose jobs failed are tried again; the first time at
+/// the start.
 const WALK_EVERY: Duration = Duration::from_hours(24);
 /// How old such a file must be. Whatever is younger may belong to a row that is about to be committed.
 const ORPHAN_AGE: Duration = Duration::from_hours(1);
@@ -190,6 +191,11 @@ impl Pool {
             tokio::select! {
                 _ = tick.tick() => {}
                 _ = walk.tick() => {
+                    match self.0.store.queue_removals().await {
+                        Ok(0) => {}
+                        Ok(scans) => tracing::warn!(scans, "deletions whose jobs failed are tried again"),
+                        Err(error) => tracing::error!(%error, "deletions whose jobs failed cannot be looked for"),
+                    }
                     match self.0.store.note_orphans(ORPHAN_AGE).await {
                         Ok(0) => {}
                         Ok(files) => tracing::info!(files, "files that a crash left behind are found"),

@@ -135,6 +135,12 @@ mod tests {
                 pairs: Vec::new(),
                 engine: "test".to_owned(),
                 scans: Vec::new(),
+                forgotten: claim
+                    .job
+                    .scan
+                    .filter(|_| claim.job.kind == JobKind::Removal)
+                    .into_iter()
+                    .collect(),
                 outcomes: vec![(claim.job.id, Ok(json!({})))],
             };
             self.store.publish(&claim.lease, &publication).await.unwrap();

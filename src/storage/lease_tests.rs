@@ -52,6 +52,7 @@ impl Fixture {
             pairs: Vec::new(),
             engine: "test".to_owned(),
             scans: Vec::new(),
+            forgotten: Vec::new(),
             outcomes: claim.lease.all().map(|job| (job, Ok(json!({})))).collect(),
         }
     }

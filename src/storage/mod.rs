@@ -30,6 +30,7 @@ mod projects;
 mod publication;
 mod quotas;
 mod references;
+mod removals;
 mod rows;
 mod scans;
 mod setbacks;

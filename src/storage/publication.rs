@@ -1,9 +1,9 @@
 //! Publishing a version: the one transaction by which a model changes.
 
 use serde_json::Value;
-use sqlx::{Sqlite, Transaction};
 
 use super::claims::check;
+use super::removals::forget;
 use super::rows::to_json;
 use super::thinning::thin;
 use super::{BlobId, Lease, StorageError, Store};
@@ -37,6 +37,8 @@ pub struct Publication {
     pub engine: String,
     /// Scans whose standing changed.
     pub scans: Vec<ScanChange>,
+    /// Deleted scans that the model holds no more.
+    pub forgotten: Vec<ScanId>,
     /// How each job of the lease ends.
     pub outcomes: Vec<(JobId, Result<Value, Fault>)>,
 }
@@ -93,6 +95,10 @@ impl Store {
                 .await?;
             thin(&mut tx, &project, number).await?;
         }
+        // Before new pairs: the same content may have come again.
+        for scan in &publication.forgotten {
+            forget(&mut tx, *scan, &project, now).await?;
+        }
         for (a, b, result) in &publication.pairs {
             sqlx::query("INSERT OR REPLACE INTO pairs VALUES (?, ?, ?, ?, ?)")
                 .bind(&project)
@@ -134,45 +140,9 @@ impl Store {
             .execute(&mut *tx)
             .await?;
         }
-        if publication.kind == JobKind::Removal {
-            forget(&mut tx, lease.job, &project, now).await?;
-        }
         tx.commit().await?;
         self.announce(publication.outcomes.iter().map(|(job, _)| *job));
         self.ring();
         Ok(())
     }
-}
-
-/// Lets go of all that was kept for the deleted scan of a removal: the model holds it no more. Merged clouds and pictures
-/// of the project go too, because older versions show it.
-async fn forget(
-    tx: &mut Transaction<'static, Sqlite>,
-    removal: JobId,
-    project: &str,
-    now: Timestamp,
-) -> Result<(), StorageError> {
-    let job = removal.to_string();
-    sqlx::query("UPDATE scans SET forgotten_ms = ? WHERE id = (SELECT scan_id FROM jobs WHERE id = ?)")
-        .bind(now.0)
-        .bind(&job)
-        .execute(&mut **tx)
-        .await?;
-    sqlx::query(
-        "DELETE FROM derived WHERE project_id = ?1
-           AND (scan_id IS NULL OR scan_id = (SELECT scan_id FROM jobs WHERE id = ?2))",
-    )
-    .bind(project)
-    .bind(&job)
-    .execute(&mut **tx)
-    .await?;
-    sqlx::query(
-        "DELETE FROM pairs WHERE project_id = ?1 AND (SELECT s.content_key FROM jobs j JOIN scans s ON s.id = j.scan_id
-           WHERE j.id = ?2) IN (a, b)",
-    )
-    .bind(project)
-    .bind(&job)
-    .execute(&mut **tx)
-    .await?;
-    Ok(())
 }

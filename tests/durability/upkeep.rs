@@ -5,6 +5,8 @@ use std::path::Path;
 
 use reqwest::StatusCode;
 use serde_json::Value;
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{Connection as _, Row as _, SqliteConnection};
 
 use crate::process::{Process, blob, cairn, check, room};
 
@@ -36,6 +38,52 @@ fn files(data: &Path) -> Vec<std::path::PathBuf> {
     };
     let folders = inside(data.join("blobs")).into_iter().filter(|f| !f.ends_with("partial")).flat_map(inside);
     folders.flat_map(inside).collect()
+}
+
+/// Marks a scan as deleted that no job is to remove, which is what a removal that failed leaves behind.
+async fn half_deleted(data: &Path, scan: &Value) -> SqliteConnection {
+    let options = SqliteConnectOptions::new().filename(data.join("cairn.sqlite"));
+    let mut database = SqliteConnection::connect_with(&options).await.unwrap();
+    sqlx::query("UPDATE scans SET deleted_ms = 1 WHERE id = ?")
+        .bind(scan["id"].as_str().unwrap())
+        .execute(&mut database)
+        .await
+        .unwrap();
+    database
+}
+
+#[tokio::test]
+async fn a_deletion_whose_job_failed_is_carried_out_by_the_next_job_or_at_the_next_start() {
+    let dir = tempfile::tempdir().unwrap();
+    let (mut service, project, uploads) = filled(dir.path()).await;
+    let placed = async |service: &Process| -> Vec<String> {
+        let model = service.json(&format!("{project}/model")).await;
+        let scans = model["scans"].as_array().unwrap().iter();
+        scans.map(|scan| scan["scan"].as_str().unwrap().to_owned()).collect()
+    };
+    let id = |upload: &Value| upload["scan"]["id"].as_str().unwrap().to_owned();
+    let mut database = half_deleted(dir.path(), &uploads[0]["scan"]).await;
+    let third = service.accepted(&project, room(0.8)).await;
+    assert_eq!(service.ended(&third["job"]).await["status"], "succeeded");
+    let [second, third] = [id(&uploads[1]), id(&third)];
+    assert_eq!(placed(&service).await, [second.clone(), third.clone()]);
+    let forgotten = "SELECT COUNT(*) FROM scans WHERE forgotten_ms IS NOT NULL";
+    let row = sqlx::query(forgotten).fetch_one(&mut database).await.unwrap();
+    assert_eq!(row.get::<i64, _>(0), 1);
+
+    half_deleted(dir.path(), &uploads[1]["scan"]).await.close().await.unwrap();
+    service.kill();
+    let service = Process::start(dir.path());
+    let begun = std::time::Instant::now();
+    while sqlx::query(forgotten).fetch_one(&mut database).await.unwrap().get::<i64, _>(0) < 2 {
+        assert!(begun.elapsed() < std::time::Duration::from_mins(1), "the second is never removed");
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    assert!(!placed(&service).await.contains(&second));
+    let jobs = service.all_ended(&project).await;
+    assert_eq!(jobs.last().unwrap()["kind"], "removal");
+    drop(service);
+    assert_eq!(check(dir.path(), &[]).0, 0);
 }
 
 #[tokio::test]
