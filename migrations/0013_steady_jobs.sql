@@ -3,3 +3,7 @@ ALTER TABLE jobs ADD COLUMN waits INTEGER NOT NULL DEFAULT 0;
 
 -- Scans that were deleted and that the model may still hold.
 CREATE INDEX scans_to_be_forgotten ON scans (project_id) WHERE deleted_ms IS NOT NULL AND forgotten_ms IS NULL;
+
+-- Asked with every renewal of a claim and every look of a worker's watch: the members of a batch, and the jobs of a scan.
+CREATE INDEX jobs_of_leader ON jobs (leader) WHERE leader IS NOT NULL;
+CREATE INDEX jobs_of_scan ON jobs (scan_id) WHERE scan_id IS NOT NULL;

@@ -100,6 +100,14 @@ const NEXT_TO_INGEST: &str = "
       FROM projects p)
     WHERE seq IS NOT NULL ORDER BY workers, turn, seq LIMIT 1";
 
+/// The revision of a job (?1) that this attempt (?2) holds, and how many members its batch has.
+const HELD: &str = "SELECT revision, (SELECT COUNT(*) FROM jobs WHERE leader = ?1 AND state = 'running') AS members FROM jobs
+    WHERE id = ?1 AND attempt = ?2 AND worker IS NOT NULL AND state = 'running'";
+/// The members of a batch.
+const MEMBERS: &str = "SELECT * FROM jobs WHERE leader = ? AND state = 'running' ORDER BY seq";
+/// Lets the members of a batch go.
+const FREE_MEMBERS: &str = "UPDATE jobs SET leader = NULL WHERE leader = ?";
+
 impl Store {
     /// Takes up the job of a lane whose turn it is, if any is ready. A registration in the map lane brings up to `batch - 1` others of
     /// its project with it, unless one of them failed before: then each goes alone. Those whose worker died before also go alone,
@@ -159,10 +167,7 @@ impl Store {
         .fetch_optional(&self.read)
         .await?
         .ok_or(StorageError::Fenced { job: id, attempt })?;
-        let members = sqlx::query("SELECT * FROM jobs WHERE leader = ? AND state = 'running' ORDER BY seq")
-            .bind(id.to_string())
-            .fetch_all(&self.read)
-            .await?;
+        let members = sqlx::query(MEMBERS).bind(id.to_string()).fetch_all(&self.read).await?;
         let members = members.iter().map(job).collect::<Result<_, _>>()?;
         let lane =
             word(&row, "lane", |word| [Lane::Ingest, Lane::Map].into_iter().find(|l| l.as_str() == word))?;
@@ -209,14 +214,11 @@ impl Store {
 
     /// The revision of a job that is still held by this claim, with its whole batch; `None` if it is not.
     pub async fn holds(&self, lease: &Lease) -> Result<Option<u64>, StorageError> {
-        let row = sqlx::query(
-            "SELECT revision, (SELECT COUNT(*) FROM jobs WHERE leader = ?1 AND state = 'running') AS members FROM jobs
-               WHERE id = ?1 AND attempt = ?2 AND worker IS NOT NULL AND state = 'running'",
-        )
-        .bind(lease.job.to_string())
-        .bind(i64::from(lease.attempt))
-        .fetch_optional(&self.read)
-        .await?;
+        let row = sqlx::query(HELD)
+            .bind(lease.job.to_string())
+            .bind(i64::from(lease.attempt))
+            .fetch_optional(&self.read)
+            .await?;
         let Some(row) = row else { return Ok(None) };
         let whole = row.try_get::<i64, _>("members")? == lease.members.len() as i64;
         if whole { Ok(Some(count(&row, "revision")?)) } else { Ok(None) }
@@ -329,19 +331,14 @@ async fn join_batch(
 
 /// Whether a lease still holds the job and every member.
 pub(super) async fn check(tx: &mut Transaction<'static, Sqlite>, lease: &Lease) -> Result<(), StorageError> {
-    let row = sqlx::query(
-        "SELECT (SELECT COUNT(*) FROM jobs WHERE id = ?1 AND attempt = ?2 AND worker IS NOT NULL AND state = 'running')
-           AS held, (SELECT COUNT(*) FROM jobs WHERE leader = ?1 AND state = 'running') AS members",
-    )
-    .bind(lease.job.to_string())
-    .bind(i64::from(lease.attempt))
-    .fetch_one(&mut **tx)
-    .await?;
-    let (held, members): (i64, i64) = (row.try_get("held")?, row.try_get("members")?);
-    if held == 1 && usize::try_from(members).is_ok_and(|n| n == lease.members.len()) {
-        Ok(())
-    } else {
-        Err(StorageError::Fenced { job: lease.job, attempt: lease.attempt })
+    let row = sqlx::query(HELD)
+        .bind(lease.job.to_string())
+        .bind(i64::from(lease.attempt))
+        .fetch_optional(&mut **tx)
+        .await?;
+    match row {
+        Some(row) if row.try_get::<i64, _>("members")? == lease.members.len() as i64 => Ok(()),
+        _ => Err(StorageError::Fenced { job: lease.job, attempt: lease.attempt }),
     }
 }
 
@@ -356,10 +353,40 @@ pub(super) async fn free(tx: &mut Transaction<'static, Sqlite>, lease: &Lease) -
     .await?;
     let held = done.rows_affected() > 0;
     if held {
-        sqlx::query("UPDATE jobs SET leader = NULL WHERE leader = ?")
-            .bind(lease.job.to_string())
-            .execute(&mut **tx)
-            .await?;
+        free_members(tx, lease.job).await?;
     }
     Ok(held)
+}
+
+/// Lets the members of a batch go whose leader nobody holds any more.
+pub(super) async fn free_members(
+    tx: &mut Transaction<'static, Sqlite>,
+    leader: JobId,
+) -> Result<(), StorageError> {
+    sqlx::query(FREE_MEMBERS).bind(leader.to_string()).execute(&mut **tx).await?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use sqlx::Row as _;
+
+    use super::*;
+    use crate::storage::setbacks::STRAYS;
+    use crate::storage::testing::Fixture;
+
+    #[tokio::test]
+    async fn watching_a_claim_takes_no_longer_the_more_jobs_there_ever_were() {
+        let at = Fixture::new().await;
+        let removals = format!("SELECT 1 FROM scans s WHERE {}", crate::storage::removals::UNDONE);
+        for query in [HELD, MEMBERS, FREE_MEMBERS, STRAYS, &removals, "DELETE FROM jobs WHERE scan_id = ?"] {
+            let explained = format!("EXPLAIN QUERY PLAN {query}");
+            let rows = sqlx::query(sqlx::AssertSqlSafe(explained)).fetch_all(&at.store.read).await.unwrap();
+            for step in rows.iter().map(|row| row.get::<String, _>("detail")) {
+                let narrow = step.starts_with("SEARCH")
+                    || ["jobs_of_leader", "scans_to_be_forgotten"].iter().any(|index| step.contains(index));
+                assert!(narrow || step.contains("SUBQUERY"), "{query}: {step}");
+            }
+        }
+    }
 }

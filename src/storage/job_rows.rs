@@ -3,6 +3,7 @@
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, Sqlite, Transaction};
 
+use super::claims::free_members;
 use super::quotas::Addition;
 use super::rows::{count, json, parsed, word};
 use super::{Page, Seal, StorageError, Store};
@@ -97,10 +98,7 @@ impl Store {
         .execute(&mut *tx)
         .await?;
         // Members of a batch that lost its leader are free again.
-        sqlx::query("UPDATE jobs SET leader = NULL WHERE leader = ?")
-            .bind(id.to_string())
-            .execute(&mut *tx)
-            .await?;
+        free_members(&mut tx, id).await?;
         tx.commit().await?;
         let job = self.job(id).await?;
         if done.rows_affected() == 0 {

@@ -11,14 +11,13 @@ use super::{StorageError, Store};
 use crate::project::{JobId, JobKind, Lane, ProjectId, ScanId, Timestamp};
 
 /// The SQL condition that a scan `s` was deleted, is not forgotten, and no job is to see to it.
-const UNDONE: &str = "s.deleted_ms IS NOT NULL AND s.forgotten_ms IS NULL AND NOT EXISTS
+pub(super) const UNDONE: &str = "s.deleted_ms IS NOT NULL AND s.forgotten_ms IS NULL AND NOT EXISTS
     (SELECT 1 FROM jobs r WHERE r.scan_id = s.id AND r.kind = 'removal' AND r.state IN ('accepted', 'running'))";
 
 impl Store {
     /// Deleted scans that the model may still hold although their removals have ended. Whatever publishes next leaves them out.
     pub async fn undone_removals(&self, project: ProjectId) -> Result<Vec<ScanId>, StorageError> {
-        let query =
-            format!("SELECT s.id FROM scans s WHERE s.project_id = ? AND {UNDONE} ORDER BY s.arrival");
+        let query = format!("SELECT s.id FROM scans s WHERE s.project_id = ? AND {UNDONE}");
         let rows =
             sqlx::query(sqlx::AssertSqlSafe(query)).bind(project.to_string()).fetch_all(&self.read).await?;
         rows.iter().map(|row| parsed(row, "id")).collect()

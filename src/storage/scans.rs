@@ -3,6 +3,7 @@
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, Sqlite, Transaction};
 
+use super::claims::free_members;
 use super::job_rows::{charge_job, insert_job};
 use super::quotas::Addition;
 use super::rows::{count, json, parsed, to_json, word};
@@ -191,10 +192,7 @@ impl Store {
         .execute(&mut *tx)
         .await?;
         // If it led a batch, the members are free again.
-        sqlx::query("UPDATE jobs SET leader = NULL WHERE leader = ?")
-            .bind(registration.to_string())
-            .execute(&mut *tx)
-            .await?;
+        free_members(&mut tx, registration).await?;
         insert_job(&mut tx, job, project, Some(id), JobKind::Removal, Lane::Map, now).await?;
         tx.commit().await?;
         self.announce([registration, job]);

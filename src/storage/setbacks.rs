@@ -38,6 +38,10 @@ const MAX_CRASHES: i64 = 3;
 /// How often the service may die while it is at a job alone, where jobs have no process of their own.
 const MAX_LOSSES: i64 = 8;
 
+/// Lets go of all members of batches whose leaders nobody holds.
+pub(super) const STRAYS: &str = "UPDATE jobs SET leader = NULL WHERE leader IS NOT NULL AND NOT EXISTS
+    (SELECT 1 FROM jobs l WHERE l.id = jobs.leader AND l.worker IS NOT NULL)";
+
 /// How long the n-th retry waits.
 fn backoff(n: i64) -> Duration {
     Duration::from_millis(500 << n.clamp(0, 6))
@@ -184,12 +188,7 @@ impl Store {
         jobs: Vec<JobId>,
     ) -> Result<usize, StorageError> {
         // Members must never wait for a leader that nobody holds.
-        sqlx::query(
-            "UPDATE jobs SET leader = NULL WHERE leader IS NOT NULL AND NOT EXISTS
-               (SELECT 1 FROM jobs l WHERE l.id = jobs.leader AND l.worker IS NOT NULL)",
-        )
-        .execute(&mut *tx)
-        .await?;
+        sqlx::query(STRAYS).execute(&mut *tx).await?;
         tx.commit().await?;
         let n = jobs.len();
         self.announce(jobs);
