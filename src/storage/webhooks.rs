@@ -37,6 +37,15 @@ const MOST: u32 = 20;
 /// How long a message that is delivered or given up can be looked at.
 const REMEMBERED: Duration = Duration::from_hours(30 * 24);
 
+/// Of each webhook the oldest message that is due (?).
+const DUE: &str = "SELECT d.*, w.url, w.secret FROM webhooks w JOIN deliveries d ON d.seq =
+    (SELECT p.seq FROM deliveries p WHERE p.webhook_id = w.id AND p.state = 'pending' AND p.not_before_ms <= ?
+     ORDER BY p.seq LIMIT 1)";
+/// When the next message is due.
+const NEXT: &str = "SELECT MIN(not_before_ms) AS next FROM deliveries WHERE state = 'pending'";
+/// Forgets messages that ended before a moment (?).
+const FORGET: &str = "DELETE FROM deliveries WHERE ended_ms < ?";
+
 impl Store {
     /// Registers a webhook.
     pub async fn create_webhook(
@@ -115,15 +124,9 @@ impl Store {
         rows.iter().map(|row| Ok((row.try_get("seq")?, delivery(row)?))).collect()
     }
 
-    /// The oldest message of each webhook, if it is due by `now`.
+    /// Of each webhook the oldest message that is due by `now`.
     pub async fn due_deliveries(&self, now: Timestamp) -> Result<Vec<DueDelivery>, StorageError> {
-        let rows = sqlx::query(
-            "SELECT d.*, w.url, w.secret, MIN(d.seq) FROM deliveries d JOIN webhooks w ON w.id = d.webhook_id
-               WHERE d.state = 'pending' AND d.not_before_ms <= ? GROUP BY d.webhook_id",
-        )
-        .bind(now.0)
-        .fetch_all(&self.read)
-        .await?;
+        let rows = sqlx::query(DUE).bind(now.0).fetch_all(&self.read).await?;
         let due = rows.iter().map(|row| {
             let secret: Vec<u8> = row.try_get("secret")?;
             let bytes = <[u8; 32]>::try_from(secret).map_err(|_| StorageError::BadRow {
@@ -141,9 +144,7 @@ impl Store {
 
     /// When the next message is due, if one waits.
     pub async fn next_delivery(&self) -> Result<Option<Timestamp>, StorageError> {
-        let row = sqlx::query("SELECT MIN(not_before_ms) AS next FROM deliveries WHERE state = 'pending'")
-            .fetch_one(&self.read)
-            .await?;
+        let row = sqlx::query(NEXT).fetch_one(&self.read).await?;
         Ok(row.try_get::<Option<i64>, _>("next")?.map(Timestamp))
     }
 
@@ -174,7 +175,7 @@ impl Store {
     /// Forgets messages that ended long ago.
     pub async fn forget_deliveries(&self, now: Timestamp) -> Result<(), StorageError> {
         let mut tx = self.begin().await?;
-        sqlx::query("DELETE FROM deliveries WHERE ended_ms < ?")
+        sqlx::query(FORGET)
             .bind(now.0.saturating_sub(REMEMBERED.as_millis() as i64))
             .execute(&mut *tx)
             .await?;
@@ -205,4 +206,73 @@ fn delivery(row: &SqliteRow) -> Result<Delivery, StorageError> {
         created: Timestamp(row.try_get("created_ms")?),
         ended: row.try_get::<Option<i64>, _>("ended_ms")?.map(Timestamp),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::project::JobKind;
+    use crate::storage::testing::Fixture;
+
+    impl Fixture {
+        async fn due(&self, now: Timestamp) -> Vec<i64> {
+            let due = self.store.due_deliveries(now).await.unwrap();
+            let mut seqs = Vec::new();
+            for message in due {
+                let row = sqlx::query("SELECT seq FROM deliveries WHERE id = ?").bind(message.delivery.id);
+                seqs.push(row.fetch_one(&self.store.read).await.unwrap().get("seq"));
+            }
+            seqs.sort_unstable();
+            seqs
+        }
+    }
+
+    #[tokio::test]
+    async fn each_webhook_gets_the_oldest_message_that_is_due() {
+        let at = Fixture::new().await;
+        for url in ["https://a.example/", "https://b.example/"] {
+            at.store.create_webhook(at.project, url, &SigningSecret([7; 32]), Seal::none()).await.unwrap();
+        }
+        for _ in 0..2 {
+            let job = at.store.create_job(at.project, JobKind::Rebuild, None, Seal::none()).await.unwrap();
+            at.store.dismiss_job(job.id).await.unwrap();
+        }
+        let now = Timestamp::now();
+        assert_eq!(at.due(now).await, [1, 2]);
+        let first = &at.store.due_deliveries(now).await.unwrap()[0].delivery.id;
+        let late = Attempt {
+            status: None,
+            error: Some("for the test".to_owned()),
+            again: Some(now.plus(Duration::from_mins(1))),
+        };
+        at.store.record_attempt(first, &late).await.unwrap();
+        assert_eq!(at.due(now).await.len(), 2, "the next one of that webhook");
+        assert_eq!(at.store.next_delivery().await.unwrap(), Some(Timestamp(0)));
+        assert_eq!(at.due(now.plus(Duration::from_mins(2))).await, [1, 2]);
+        let taken = Attempt { status: Some(200), error: None, again: None };
+        for message in at.store.due_deliveries(now).await.unwrap() {
+            at.store.record_attempt(&message.delivery.id, &taken).await.unwrap();
+        }
+        at.store.forget_deliveries(now.plus(2 * REMEMBERED)).await.unwrap();
+        let left =
+            sqlx::query("SELECT COUNT(*) AS n FROM deliveries").fetch_one(&at.store.read).await.unwrap();
+        assert_eq!(left.get::<i64, _>("n"), 2, "those that ended are forgotten, those that wait are not");
+    }
+
+    #[tokio::test]
+    async fn upkeep_of_messages_reads_only_those_that_it_is_about() {
+        let at = Fixture::new().await;
+        for query in [DUE, NEXT, FORGET] {
+            let explained = format!("EXPLAIN QUERY PLAN {query}");
+            let rows = sqlx::query(sqlx::AssertSqlSafe(explained)).fetch_all(&at.store.read).await.unwrap();
+            for step in rows.iter().map(|row| row.get::<String, _>("detail")) {
+                let narrow =
+                    ["SCAN w", "PRIMARY KEY", "deliveries_pending", "deliveries_by_end", "deliveries_due"];
+                assert!(
+                    step.contains("SUBQUERY") || narrow.iter().any(|index| step.contains(index)),
+                    "{query}: {step}"
+                );
+            }
+        }
+    }
 }
