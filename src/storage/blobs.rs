@@ -159,8 +159,9 @@ impl BlobStore {
         self.root.join("partial").join(Ulid::generate().to_string())
     }
 
-    /// Deletes the files of those blobs that nobody has pinned and that are not younger than `age`; returns which. Blocks.
-    pub(super) fn remove_unpinned(&self, ids: &[BlobId], age: Duration) -> Result<Vec<BlobId>, StorageError> {
+    /// Deletes the files of those blobs that nobody has pinned and that are not younger than `age`; returns which. What cannot be deleted is
+    /// logged and stays. Blocks.
+    pub(super) fn remove_unpinned(&self, ids: &[BlobId], age: Duration) -> Vec<BlobId> {
         let mut removed = Vec::with_capacity(ids.len());
         for id in ids {
             let pins = self.pins.lock();
@@ -169,8 +170,8 @@ impl BlobStore {
                 continue;
             }
             match fs::remove_file(path) {
-                Err(e) if e.kind() != io::ErrorKind::NotFound => {
-                    return Err(StorageError::io("deleting a blob")(e));
+                Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                    tracing::error!(blob = %id, %error, "a file that nothing needs any more cannot be deleted");
                 }
                 _ => {
                     self.ledger.forget(*id);
@@ -178,7 +179,7 @@ impl BlobStore {
                 }
             }
         }
-        Ok(removed)
+        removed
     }
 
     /// Blobs whose pins went since the last call.
@@ -279,16 +280,13 @@ mod tests {
         let (first, second) = (store.put(b"needed").unwrap(), store.put(b"needed").unwrap());
         let id = first.id;
         drop(first);
-        assert_eq!(
-            (store.remove_unpinned(&[id], Duration::ZERO).unwrap(), store.take_released()),
-            (vec![], vec![])
-        );
+        assert_eq!((store.remove_unpinned(&[id], Duration::ZERO), store.take_released()), (vec![], vec![]));
         drop(second);
         assert_eq!(store.take_released(), [id]);
-        assert_eq!(store.remove_unpinned(&[id], Duration::ZERO).unwrap(), [id]);
+        assert_eq!(store.remove_unpinned(&[id], Duration::ZERO), [id]);
         assert!(!store.contains(id));
         assert_eq!(
-            store.remove_unpinned(&[id], Duration::ZERO).unwrap(),
+            store.remove_unpinned(&[id], Duration::ZERO),
             [id],
             "a file that is gone already is no error"
         );

@@ -30,7 +30,8 @@ pub(super) fn needed(name: &str) -> String {
 
 impl Store {
     /// Deletes the files of blobs that no row needs any more, unless a [`Hold`](super::Hold) keeps them or they are younger than `age`:
-    /// another process that works for this one may be about to commit their rows. Returns how many.
+    /// another process that works for this one may be about to commit their rows. What cannot be deleted stays noted and is tried again
+    /// the next time. Returns how many went.
     pub async fn collect_garbage(&self, age: Duration) -> Result<usize, StorageError> {
         let now = Timestamp::now();
         self.forget_uploads(now).await?;
@@ -60,7 +61,7 @@ impl Store {
             let blobs = self.blobs.clone();
             let removed = tokio::task::spawn_blocking(move || blobs.remove_unpinned(&unneeded, age))
                 .await
-                .map_err(|e| StorageError::io("deleting blobs")(std::io::Error::other(e)))??;
+                .map_err(|e| StorageError::io("deleting blobs")(std::io::Error::other(e)))?;
             collected += removed.len();
             for id in settled.iter().chain(&removed) {
                 sqlx::query("DELETE FROM garbage WHERE blob = ?")
@@ -95,7 +96,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::project::{JobKind, Lane, ProjectId, Scan, VersionNumber};
+    use crate::project::{JobKind, Lane, ProjectId, Scan, UploadId, VersionNumber};
     use crate::storage::testing::{Fixture, new_scan, project};
     use crate::storage::{Claim, NewVersion, Owner, Publication, Seal};
 
@@ -199,5 +200,33 @@ mod tests {
         assert_eq!(f.left(&["fresh"]).await, [true]);
         drop(fresh);
         assert_eq!(f.left(&["fresh"]).await, [false]);
+    }
+
+    #[tokio::test]
+    async fn a_file_that_cannot_be_deleted_keeps_no_other_and_goes_when_it_can() {
+        let f = Fixture::new().await;
+        let texts = ["first", "second", "third"];
+        let ids = texts.map(|text| f.blob(text).id);
+        // A folder in its place cannot be deleted as a file, whoever the tests run as.
+        let stuck = f.store.blobs.path(ids[1]);
+        std::fs::remove_file(&stuck).unwrap();
+        std::fs::create_dir(&stuck).unwrap();
+        f.left(&texts).await;
+        let there = || ids.map(|id| f.store.blobs.path(id).exists());
+        assert_eq!(there(), [false, true, false]);
+        std::fs::remove_dir(&stuck).unwrap();
+        std::fs::write(&stuck, "second").unwrap();
+        f.left(&texts).await;
+        assert_eq!(there(), [false; 3]);
+    }
+
+    #[tokio::test]
+    async fn an_upload_that_cannot_be_deleted_keeps_nothing_else() {
+        let f = Fixture::new().await;
+        let stuck = f.store.uploads.path(UploadId::generate());
+        std::fs::create_dir(&stuck).unwrap();
+        drop(f.blob("unneeded"));
+        assert_eq!(f.left(&["unneeded"]).await, [false]);
+        assert!(stuck.exists());
     }
 }

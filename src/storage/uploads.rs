@@ -163,7 +163,7 @@ impl Store {
     }
 
     /// Deletes the bytes of uploads that have expired by `now` or that no row knows, and the rows that have been expired
-    /// for a day. Returns how many files went.
+    /// for a day. What cannot be deleted is tried again the next time. Returns how many files went.
     pub(super) async fn forget_uploads(&self, now: Timestamp) -> Result<usize, StorageError> {
         let files = self.uploads.clone();
         let mut removed = 0;
@@ -175,8 +175,12 @@ impl Store {
             };
             if !needed {
                 let files = self.uploads.clone();
-                blocking("deleting an upload", move || files.remove(id)).await?;
-                removed += 1;
+                match blocking("deleting an upload", move || files.remove(id)).await {
+                    Ok(()) => removed += 1,
+                    Err(error) => {
+                        tracing::error!(upload = %id, %error, "the bytes of an upload cannot be deleted");
+                    }
+                }
             }
         }
         let before = now.0.saturating_sub(i64::try_from(REMEMBERED.as_millis()).unwrap_or(i64::MAX));
