@@ -6,7 +6,7 @@
 //! Used by `http/tus`.
 
 use std::fmt::Display;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt};
@@ -171,6 +171,7 @@ impl Resumable {
             written: upload.received,
             kept: upload.received,
             check: DigestCheck::new(request.digests),
+            noted: Instant::now(),
         };
         let ended = self.receive(&turn, &upload, &mut arrival, body).await;
         match self.conclude(upload, arrival, ended).await {
@@ -185,7 +186,8 @@ impl Resumable {
         }
     }
 
-    /// Writes what comes, until it ends or something is wrong.
+    /// Writes what comes, until it ends or something is wrong. As long as it comes, the upload does not expire, even where nothing of it
+    /// is noted before its digest is known.
     async fn receive<E: Display>(
         &self,
         turn: &Turn,
@@ -211,6 +213,7 @@ impl Resumable {
                 return Err(ResumableError::PastEnd { length });
             }
             arrival.take(&piece).await?;
+            self.stay_alive(upload.id, arrival).await?;
             if received < HEAD_BYTES as u64 && arrival.written >= HEAD_BYTES as u64 {
                 // Known early, so that a wrong file of many gigabytes is refused after its first few kilobytes.
                 recognise(&arrival.head, &upload.announced.name)?;
@@ -222,8 +225,8 @@ impl Resumable {
             self.intake.check_room(0)?;
             if arrival.check.is_empty() {
                 arrival.file.sync().await?;
-                self.store.advance_upload(upload.id, arrival.written, self.expiry()).await?;
-                arrival.kept = arrival.written;
+                self.advance(upload.id, arrival.written).await?;
+                (arrival.kept, arrival.noted) = (arrival.written, Instant::now());
             }
         }
     }
@@ -235,7 +238,7 @@ impl Resumable {
         arrival: Arrival,
         ended: Result<(), ResumableError>,
     ) -> Result<Upload, ResumableError> {
-        let Arrival { head, mut file, written, kept, check } = arrival;
+        let Arrival { head, mut file, written, kept, check, .. } = arrival;
         let whole = written == upload.announced.length;
         let ended = match ended {
             // The last byte came: how the request ended after it does not matter.
@@ -257,8 +260,7 @@ impl Resumable {
                 if whole {
                     return self.finish(upload, &head).await;
                 }
-                let expires = self.expiry();
-                self.store.advance_upload(upload.id, written, expires).await?;
+                let expires = self.advance(upload.id, written).await?;
                 ended.map(|()| Upload { received: written, expires, blob: None, ..upload })
             }
         }
@@ -300,9 +302,28 @@ impl Resumable {
     /// Sees to it that an upload does not expire while it is written to.
     async fn keep_alive(&self, upload: &Upload) -> Result<(), ResumableError> {
         if upload.expires < Timestamp::now().plus(self.lifetime / 2) {
-            self.store.advance_upload(upload.id, upload.received, self.expiry()).await?;
+            self.advance(upload.id, upload.received).await?;
         }
         Ok(())
+    }
+
+    /// The same while bytes come.
+    async fn stay_alive(&self, id: UploadId, arrival: &mut Arrival) -> Result<(), ResumableError> {
+        if arrival.noted.elapsed() >= self.lifetime / 4 {
+            self.advance(id, arrival.kept).await?;
+            arrival.noted = Instant::now();
+        }
+        Ok(())
+    }
+
+    /// Notes how many bytes of an upload are safe. Returns when it expires from now on.
+    async fn advance(&self, id: UploadId, received: u64) -> Result<Timestamp, ResumableError> {
+        let expires = self.expiry();
+        match self.store.advance_upload(id, received, expires).await {
+            // Its client is told whether it has expired.
+            Err(gone @ StorageError::NoUpload(_)) => Err(self.peek(id).await.err().unwrap_or(gone.into())),
+            other => Ok(other.map(|()| expires)?),
+        }
     }
 
     fn expiry(&self) -> Timestamp {
@@ -335,6 +356,8 @@ struct Arrival {
     /// Those of them that are synced and noted.
     kept: u64,
     check: DigestCheck,
+    /// When the upload's row was last written, at the latest.
+    noted: Instant,
 }
 
 impl Arrival {

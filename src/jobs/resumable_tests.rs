@@ -64,9 +64,14 @@ impl Service {
 }
 
 fn resumable(store: &Store) -> Resumable {
+    lasting(store, Duration::from_hours(1))
+}
+
+/// Uploads that expire after this time.
+fn lasting(store: &Store, lifetime: Duration) -> Resumable {
     let limits = IntakeLimits { max_bytes: LIMIT, idle: Duration::from_secs(5), free_bytes: 0 };
     let intake = Intake::new(store.clone(), limits);
-    Resumable::new(store.clone(), intake, Duration::from_hours(1), CancellationToken::new())
+    Resumable::new(store.clone(), intake, lifetime, CancellationToken::new())
 }
 
 /// Points as text; the same length from the same source is the same content.
@@ -353,5 +358,28 @@ async fn an_upload_that_lost_its_bytes_says_so() {
     let answer = service.uploads.append(id, plain(500), body(&content(0, 100), 100, false)).await;
     let lost = StorageError::DamagedUpload { upload: id, kept: 500, found: 0 };
     assert_eq!(answer.unwrap_err().to_string(), lost.to_string());
+    service.store.close().await;
+}
+
+#[tokio::test]
+async fn an_upload_does_not_expire_while_its_bytes_come_even_if_all_are_kept_or_none() {
+    let mut service = Service::new().await;
+    let lifetime = Duration::from_secs(2);
+    service.uploads = lasting(&service.store, lifetime);
+    let bytes = content(0, 900);
+    let id = service.create(900).await.unwrap();
+    let store = service.store.clone();
+    let pieces: Vec<_> = bytes.chunks(180).map(Bytes::copy_from_slice).collect();
+    let slow = stream::unfold((pieces.into_iter(), store), move |(mut pieces, store)| async move {
+        let piece = pieces.next()?;
+        tokio::time::sleep(lifetime / 3).await;
+        store.collect_garbage(Duration::ZERO).await.unwrap();
+        Some((Ok::<_, &str>(piece), (pieces, store)))
+    });
+    let sha = ExpectedDigest { algorithm: DigestAlgorithm::Sha256, value: Sha256::digest(&bytes).to_vec() };
+    let request = Continuation { digests: vec![sha], ..plain(0) };
+    let done = service.uploads.append(id, request, Box::pin(slow)).await.unwrap();
+    assert!(done.end.is_some());
+    assert_eq!(service.scans().await, 1);
     service.store.close().await;
 }

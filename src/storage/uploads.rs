@@ -79,7 +79,8 @@ impl Store {
         rows.iter().map(|row| Ok((row.try_get("position")?, upload(row)?))).collect()
     }
 
-    /// Notes that the first `received` bytes are synced, fewer than all, and when the rest is given up.
+    /// Notes that the first `received` bytes are synced, fewer than all, and when the rest is given up. What has expired stays so: its
+    /// file may be gone. [`StorageError::NoUpload`] then, as for one that has ended.
     pub async fn advance_upload(
         &self,
         id: UploadId,
@@ -88,11 +89,13 @@ impl Store {
     ) -> Result<(), StorageError> {
         let mut tx = self.begin().await?;
         let done = sqlx::query(
-            "UPDATE uploads SET received = ?, expires_ms = ?, blob = NULL WHERE id = ? AND scan_id IS NULL",
+            "UPDATE uploads SET received = ?, expires_ms = ?, blob = NULL
+               WHERE id = ? AND scan_id IS NULL AND expires_ms > ?",
         )
         .bind(received.cast_signed())
         .bind(expires.0)
         .bind(id.to_string())
+        .bind(Timestamp::now().0)
         .execute(&mut *tx)
         .await?;
         tx.commit().await?;
@@ -103,11 +106,13 @@ impl Store {
     /// [`Store::held_upload`] finds it.
     pub async fn settle_upload(&self, id: UploadId, stored: StoredBlob) -> Result<FreshBlob, StorageError> {
         let mut tx = self.begin().await?;
-        let done = sqlx::query("UPDATE uploads SET blob = ? WHERE id = ? AND scan_id IS NULL")
-            .bind(stored.id.to_string())
-            .bind(id.to_string())
-            .execute(&mut *tx)
-            .await?;
+        let done =
+            sqlx::query("UPDATE uploads SET blob = ? WHERE id = ? AND scan_id IS NULL AND expires_ms > ?")
+                .bind(stored.id.to_string())
+                .bind(id.to_string())
+                .bind(Timestamp::now().0)
+                .execute(&mut *tx)
+                .await?;
         tx.commit().await?;
         if done.rows_affected() == 0 {
             return Err(StorageError::NoUpload(id));
@@ -255,6 +260,13 @@ mod tests {
             file.write(b"12345").await.unwrap();
             file.sync().await.unwrap();
         }
+        let gone = now.plus(Duration::ZERO);
+        let late_for = store.create_upload(new(other), gone, Seal::none()).await.unwrap().id;
+        let advanced = store.advance_upload(late_for, 5, late).await;
+        assert!(
+            matches!(advanced, Err(StorageError::NoUpload(id)) if id == late_for),
+            "what expired stays so"
+        );
         store.delete_project(doomed).await.unwrap();
         assert_eq!(store.forget_uploads(now.plus(Duration::from_mins(1))).await.unwrap(), 2);
         assert_eq!(store.uploads.ids().unwrap(), [alive]);
