@@ -108,9 +108,11 @@ impl Workers {
 
 impl Pool {
     async fn work(&self, worker: &str) {
+        let mut first = Lane::Map;
         while !self.0.stop.is_cancelled() {
-            match self.claim(worker).await {
+            match self.claim(worker, first).await {
                 Ok(Some((lane, claim))) => {
+                    first = lane.other();
                     let span = tracing::info_span!("job", job = %claim.job.id, kind = %claim.job.kind,
                         project = %claim.job.project, attempt = claim.job.attempt);
                     self.perform(lane, claim).instrument(span).await;
@@ -124,10 +126,11 @@ impl Pool {
         }
     }
 
-    /// Mapping first: it is what clients wait for, and only one worker a project can be at it.
-    async fn claim(&self, worker: &str) -> Result<Option<(Lane, Claim)>, StorageError> {
+    /// The next job, of the lane `first` if there is one. A worker asks the lanes in turn: a thousand small jobs of the one do not keep a
+    /// single one of the other waiting.
+    async fn claim(&self, worker: &str, first: Lane) -> Result<Option<(Lane, Claim)>, StorageError> {
         let (store, options) = (&self.0.store, &self.0.options);
-        for lane in [Lane::Map, Lane::Ingest] {
+        for lane in [first, first.other()] {
             let isolated = isolates(options);
             if let Some(claim) = store.claim(lane, worker, options.lease, options.batch, isolated).await? {
                 return Ok(Some((lane, claim)));
@@ -220,4 +223,64 @@ impl Pool {
 /// Whether suspect jobs get a process of their own.
 fn isolates(options: &WorkerOptions) -> bool {
     options.isolated.as_ref().is_some_and(|isolated| isolated.which != Isolation::Never)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::project::{Fault, JobKind};
+    use crate::storage::Retry;
+    use crate::storage::testing::{Fixture, new_scan, project};
+
+    fn pool(store: &Store) -> Pool {
+        let whatever = Duration::from_mins(1);
+        Pool(Performer {
+            store: store.clone(),
+            compute: Compute::new(1).unwrap(),
+            models: Arc::default(),
+            processes: Arc::default(),
+            demand: Arc::new(Demand::new(0)),
+            options: WorkerOptions {
+                workers: 1,
+                lease: whatever,
+                poll: whatever,
+                progress_every: whatever,
+                batch: 10,
+                max_points: 1,
+                memory_bytes: 1 << 30,
+                job_limit: whatever,
+                isolated: None,
+                collect_every: whatever,
+                grace: whatever,
+            },
+            stop: CancellationToken::new(),
+            patience: PATIENCE,
+        })
+    }
+
+    #[tokio::test]
+    async fn one_worker_reads_a_scan_after_one_of_another_projects_many_removals() {
+        let at = Fixture::new().await;
+        for key in 0..20 {
+            let blob = at.blob(&format!("scan {key}"));
+            let scan = at.store.admit_scan(&new_scan(at.project, key, *blob)).await.unwrap().scan.id;
+            at.store.delete_scan(at.project, scan).await.unwrap();
+        }
+        let blob = at.blob("single");
+        let single = new_scan(project(&at.store).await, 0, *blob);
+        let single = at.store.admit_scan(&single).await.unwrap().job.id;
+        let pool = pool(&at.store);
+        let fault = Fault { code: "internal-error".to_owned(), detail: "for the test".to_owned() };
+        let (mut first, mut kinds) = (Lane::Map, Vec::new());
+        loop {
+            let (lane, claim) = pool.claim("worker", first).await.unwrap().unwrap();
+            first = lane.other();
+            if claim.job.id == single {
+                break;
+            }
+            kinds.push(claim.job.kind);
+            at.store.fail(&claim.lease, &fault, Retry::Never).await.unwrap();
+        }
+        assert_eq!(kinds, [JobKind::Removal]);
+    }
 }

@@ -153,6 +153,15 @@ impl Lane {
     pub fn from_word(word: &str) -> Option<Self> {
         [Self::Ingest, Self::Map].into_iter().find(|lane| lane.as_str() == word)
     }
+
+    /// The lane that is not this one.
+    #[must_use]
+    pub fn other(self) -> Self {
+        match self {
+            Self::Ingest => Self::Map,
+            Self::Map => Self::Ingest,
+        }
+    }
 }
 
 /// Why a job or a scan failed, in words for the client.
