@@ -15,6 +15,7 @@ mod decisions;
 mod derived;
 mod error;
 mod figures;
+mod folders;
 mod garbage;
 mod hold;
 mod idempotency;

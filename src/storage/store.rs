@@ -12,6 +12,7 @@ use sqlx::sqlite::{
 use sqlx::{Row, Sqlite, Transaction};
 use tokio::sync::{Notify, broadcast};
 
+use super::folders::make_lasting;
 use super::{BlobStore, Hold, StorageError, UploadFiles};
 use crate::project::{JobId, Limits};
 
@@ -68,7 +69,7 @@ static MIGRATOR: Migrator = sqlx::migrate!();
 impl Store {
     /// Opens the data directory for this process alone, makes it if needed, and brings the schema up to date.
     pub async fn open(data: &Path) -> Result<Self, StorageError> {
-        std::fs::create_dir_all(data).map_err(StorageError::io("making the data directory"))?;
+        make_lasting(data)?;
         let lock = lock(data)?;
         let blobs = BlobStore::open(&data.join("blobs"))?;
         UploadFiles::open(&data.join("uploads"))?;

@@ -42,6 +42,16 @@ async fn a_full_disk_refuses_uploads_and_works_again_when_there_is_space() {
     assert_eq!(check(&data, &[]).0, 0);
 }
 
+#[test]
+fn a_data_directory_whose_name_cannot_be_synced_is_not_begun() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, faults) = (dir.path().join("above/data"), Faults::new(dir.path()));
+    faults.set("sync eio 0 /above");
+    let output = Process::refused(&data, &faults);
+    assert!(output.contains("syncing the name of a directory"), "{output}");
+    assert!(!dir.path().join("above").exists(), "the next start makes it, and syncs it");
+}
+
 #[tokio::test]
 async fn whichever_write_sync_or_rename_fails_what_was_acknowledged_is_there() {
     let dir = tempfile::tempdir().unwrap();

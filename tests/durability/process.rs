@@ -43,6 +43,15 @@ impl Process {
         Self { child, url }
     }
 
+    /// What the service says when it does not start.
+    pub fn refused(data: &Path, faults: &Faults) -> String {
+        let mut command = Command::new(program());
+        command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(data);
+        let output = command.env("LD_PRELOAD", library()).env("CAIRN_INJECT", &faults.0).output().unwrap();
+        assert!(!output.status.success());
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    }
+
     /// SIGKILL, then nothing of it is left.
     pub fn kill(&mut self) {
         self.child.kill().unwrap();
