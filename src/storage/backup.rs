@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions};
 
-use super::folders::make_lasting;
+use super::folders::make_private;
 use super::references::{Reference, references};
 use super::store::DATABASE;
 use super::{BlobId, BlobStore, StorageError, Store};
@@ -61,7 +61,7 @@ pub async fn restore(copy: &Path, data: &Path, sharing: Sharing) -> Result<Copie
 
 /// Makes the directory and says where the database goes until all else is there.
 fn prepare(to: &Path) -> Result<PathBuf, StorageError> {
-    make_lasting(to)?;
+    make_private(to)?;
     fs::create_dir_all(to.join("blobs")).map_err(StorageError::io("making the directory of the copy"))?;
     let there: Vec<_> = fs::read_dir(to)
         .and_then(|entries| entries.map(|e| Ok(e?.file_name())).collect::<io::Result<_>>())

@@ -1,16 +1,18 @@
 //! Folders that survive a power cut: their names are synced in the folders that hold them.
 
-use std::fs::File;
+use std::fs::{DirBuilder, File};
 use std::io;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
 use super::StorageError;
 
-/// Makes a folder, with all above it that are missing, and sees to it that their names last. One that
+/// Makes a folder for the eyes of its owner alone, with all above it that are missing, and sees to it that their names last. One that
 /// is there is left as it is, and so nothing is left where this fails. Blocks.
-pub(super) fn make_lasting(folder: &Path) -> Result<(), StorageError> {
+pub(super) fn make_private(folder: &Path) -> Result<(), StorageError> {
     let new = missing(folder);
-    let made = new.iter().try_for_each(|folder| make(folder));
+    let Some((last, above)) = new.split_last() else { return Ok(()) };
+    let made = above.iter().try_for_each(|folder| make(folder, 0o777)).and_then(|()| make(last, 0o700));
     let lasting = made
         .map_err(StorageError::io("making a directory"))
         .and_then(|()| names_of(&new).map_err(StorageError::io("syncing the name of a directory")));
@@ -46,8 +48,8 @@ fn holder(folder: &Path) -> &Path {
     folder.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-fn make(folder: &Path) -> io::Result<()> {
-    match std::fs::create_dir(folder) {
+fn make(folder: &Path, mode: u32) -> io::Result<()> {
+    match DirBuilder::new().mode(mode).create(folder) {
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists && folder.is_dir() => Ok(()),
         other => other,
     }
@@ -55,7 +57,15 @@ fn make(folder: &Path) -> io::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
+    use crate::storage::Store;
+
+    fn mode(folder: &Path) -> u32 {
+        fs::metadata(folder).unwrap().permissions().mode() & 0o777
+    }
 
     #[test]
     fn all_that_is_missing_is_found_and_where_its_names_are_kept() {
@@ -66,5 +76,21 @@ mod tests {
         assert_eq!(missing(Path::new("not-here/data")), ["not-here", "not-here/data"].map(PathBuf::from));
         assert_eq!(holder(&data), dir.path().join("a/b"));
         assert_eq!(holder(Path::new("not-here")), Path::new("."));
+    }
+
+    #[tokio::test]
+    async fn a_data_directory_that_is_made_is_its_owners_alone_and_one_that_is_there_stays_as_it_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let data = dir.path().join("above/data");
+        Store::open(&data).await.unwrap().close().await;
+        assert_eq!(mode(&data), 0o700);
+        let shared = dir.path().join("shared");
+        fs::create_dir(&shared).unwrap();
+        fs::set_permissions(&shared, fs::Permissions::from_mode(0o750)).unwrap();
+        Store::open(&shared).await.unwrap().close().await;
+        assert_eq!(mode(&shared), 0o750);
+        let copy = dir.path().join("copies/copy");
+        crate::storage::backup(&data, &copy, crate::storage::Sharing::Links).await.unwrap();
+        assert_eq!(mode(&copy), 0o700, "it holds the same secrets");
     }
 }

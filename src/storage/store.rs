@@ -12,7 +12,7 @@ use sqlx::sqlite::{
 use sqlx::{Row, Sqlite, Transaction};
 use tokio::sync::{Notify, broadcast};
 
-use super::folders::make_lasting;
+use super::folders::make_private;
 use super::{BlobStore, Hold, StorageError, UploadFiles};
 use crate::project::{JobId, Limits};
 
@@ -67,9 +67,9 @@ enum DataClaim {
 static MIGRATOR: Migrator = sqlx::migrate!();
 
 impl Store {
-    /// Opens the data directory for this process alone, makes it if needed, and brings the schema up to date.
+    /// Opens the data directory for this process alone, makes it if needed, readable by nobody else, and brings the schema up to date.
     pub async fn open(data: &Path) -> Result<Self, StorageError> {
-        make_lasting(data)?;
+        make_private(data)?;
         let lock = lock(data)?;
         let blobs = BlobStore::open(&data.join("blobs"))?;
         UploadFiles::open(&data.join("uploads"))?;
