@@ -20,6 +20,8 @@ mod garbage;
 mod hold;
 mod idempotency;
 mod integrity;
+#[cfg(test)]
+mod job_machine_tests;
 mod job_rows;
 mod keys;
 #[cfg(test)]
