@@ -7,7 +7,7 @@ use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{Connection as _, Row as _, SqliteConnection};
 
 use crate::process::{Faults, Process, room, until};
-use crate::resident::{lives, workers};
+use crate::resident::{lives, workers, works};
 
 fn failed(job: &Value, code: &str) {
     assert_eq!(job["status"], "failed", "{job}");
@@ -100,7 +100,7 @@ async fn a_scan_at_which_every_process_falls_silent_is_set_aside() {
     let job = format!("/v1/jobs/{}", silent["job"]["id"].as_str().unwrap());
     let mut stopped = BTreeSet::new();
     while service.json(&job).await["finished"].is_null() {
-        for process in workers(&service) {
+        for process in workers(&service).into_iter().filter(|process| works(*process)) {
             // One that has ended meanwhile cannot be stopped.
             let _ = std::process::Command::new("kill").arg("-STOP").arg(process.to_string()).output();
             stopped.insert(process);

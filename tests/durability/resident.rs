@@ -22,6 +22,12 @@ pub fn lives(process: u32) -> bool {
     fs::read(at).is_ok_and(|command| !command.is_empty())
 }
 
+/// Whether a process has become one of jobs: until then it is the service's own, which waits for it.
+pub fn works(process: u32) -> bool {
+    let at = Path::new("/proc").join(process.to_string()).join("cmdline");
+    fs::read(at).is_ok_and(|command| command.split(|byte| *byte == 0).nth(1) == Some(b"work"))
+}
+
 #[tokio::test]
 async fn processes_of_jobs_stay_for_the_next_and_end_with_the_service_however_that_ends() {
     let data = tempfile::tempdir().unwrap();
