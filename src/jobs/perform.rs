@@ -51,6 +51,8 @@ pub(super) enum Interruption {
     Overdue,
     /// It takes more memory than it may.
     TooLarge,
+    /// Its claim is not renewed any more.
+    Silent,
 }
 
 /// How long a job that was told to stop is waited for in the service. The core looks at its token every few tens of milliseconds;

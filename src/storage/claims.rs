@@ -101,12 +101,21 @@ const NEXT_TO_INGEST: &str = "
     WHERE seq IS NOT NULL ORDER BY workers, turn, seq LIMIT 1";
 
 /// The revision of a job (?1) that this attempt (?2) holds, and how many members its batch has.
-const HELD: &str = "SELECT revision, (SELECT COUNT(*) FROM jobs WHERE leader = ?1 AND state = 'running') AS members FROM jobs
+const HELD: &str = "SELECT revision, lease_ms, (SELECT COUNT(*) FROM jobs WHERE leader = ?1 AND state = 'running') AS members FROM jobs
     WHERE id = ?1 AND attempt = ?2 AND worker IS NOT NULL AND state = 'running'";
 /// The members of a batch.
 const MEMBERS: &str = "SELECT * FROM jobs WHERE leader = ? AND state = 'running' ORDER BY seq";
 /// Lets the members of a batch go.
 const FREE_MEMBERS: &str = "UPDATE jobs SET leader = NULL WHERE leader = ?";
+
+/// How a claimed job stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Held {
+    /// Grows with every change of the job.
+    pub revision: u64,
+    /// When the claim ends unless it is renewed.
+    pub until: Timestamp,
+}
 
 impl Store {
     /// Takes up the job of a lane whose turn it is, if any is ready. A registration in the map lane brings up to `batch - 1` others of
@@ -212,8 +221,8 @@ impl Store {
         Ok(())
     }
 
-    /// The revision of a job that is still held by this claim, with its whole batch; `None` if it is not.
-    pub async fn holds(&self, lease: &Lease) -> Result<Option<u64>, StorageError> {
+    /// How a job stands that is still held by this claim, with its whole batch; `None` if it is not.
+    pub async fn holds(&self, lease: &Lease) -> Result<Option<Held>, StorageError> {
         let row = sqlx::query(HELD)
             .bind(lease.job.to_string())
             .bind(i64::from(lease.attempt))
@@ -221,7 +230,8 @@ impl Store {
             .await?;
         let Some(row) = row else { return Ok(None) };
         let whole = row.try_get::<i64, _>("members")? == lease.members.len() as i64;
-        if whole { Ok(Some(count(&row, "revision")?)) } else { Ok(None) }
+        let until = Timestamp(row.try_get::<Option<i64>, _>("lease_ms")?.unwrap_or_default());
+        Ok(if whole { Some(Held { revision: count(&row, "revision")?, until }) } else { None })
     }
 
     /// Tells listeners of jobs that another process has changed and still holds: there is nothing new to claim.

@@ -50,7 +50,7 @@ pub use backup::{Copied, Sharing, backup, restore};
 pub use blob_reader::BlobReader;
 pub use blob_writer::BlobWriter;
 pub use blobs::{BlobId, BlobStore, StoredBlob};
-pub use claims::{Claim, Lease, Measures};
+pub use claims::{Claim, Held, Lease, Measures};
 pub use damage::Damage;
 pub use derived::Owner;
 pub use error::{StorageError, Trouble};

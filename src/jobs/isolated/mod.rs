@@ -29,7 +29,7 @@ pub(super) use pool::Processes;
 use process::Process;
 
 use super::perform::{Interruption, Performer, overdue, told};
-use crate::project::{Fault, Lane};
+use crate::project::{Fault, Lane, Timestamp};
 use crate::storage::Claim;
 
 /// Which jobs get a process of their own.
@@ -132,6 +132,10 @@ impl Performer {
                 tracing::warn!("a job's time is over; its process is killed");
                 (Verdict::Crashed(overdue(limit)), false)
             }
+            End::Interrupted(Interruption::Silent) => {
+                tracing::warn!("the process of a job has fallen silent; it is killed");
+                (Verdict::Crashed(fell_silent()), false)
+            }
             End::Interrupted(Interruption::TooLarge) => {
                 tracing::warn!("a job takes more memory than it may; its process is killed");
                 (Verdict::Crashed(too_large(self.options.memory_bytes)), false)
@@ -179,6 +183,7 @@ impl Performer {
         let mut tick = tokio::time::interval(self.options.progress_every);
         let (begun, mut seen) = (Instant::now(), claim.job.revision);
         let mut cores = Cores::default();
+        let mut unrenewed: Option<Instant> = None;
         loop {
             tokio::select! {
                 _ = tick.tick() => if let Some(process) = process {
@@ -198,12 +203,19 @@ impl Performer {
                 return Interruption::TooLarge;
             }
             match self.store.holds(&claim.lease).await {
-                Ok(Some(revision)) if revision != seen => {
-                    // What is told here comes back as a change, and is known then.
-                    seen = revision;
-                    self.store.relay(claim.lease.all());
+                Ok(Some(held)) => {
+                    if held.revision != seen {
+                        // What is told here comes back as a change, and is known then.
+                        seen = held.revision;
+                        self.store.relay(claim.lease.all());
+                    }
+                    // Whoever sweeps up old claims may be kept from it by this very process, which may hold the database locked.
+                    if held.until >= Timestamp::now() {
+                        unrenewed = None;
+                    } else if unrenewed.get_or_insert_with(Instant::now).elapsed() > self.options.lease {
+                        return Interruption::Silent;
+                    }
                 }
-                Ok(Some(_)) => {}
                 // Ended by the process itself, which is about to say so, or taken away.
                 Ok(None) => return Interruption::Lost,
                 Err(error) => tracing::warn!(%error, "the claim of a job cannot be watched"),
@@ -230,6 +242,12 @@ fn heard(report: io::Result<Result<Report, ExitStatus>>) -> End {
 
 fn silent(error: &io::Error) -> Fault {
     Fault { code: "worker-lost".to_owned(), detail: format!("its process cannot be heard: {error}") }
+}
+
+/// Why a job fails whose process lives and does nothing.
+fn fell_silent() -> Fault {
+    let detail = "the process that worked on it alone fell silent for longer than its lease, again and again";
+    Fault { code: "worker-lost".to_owned(), detail: detail.to_owned() }
 }
 
 /// Why a job fails whose process died.
