@@ -39,15 +39,14 @@ async fn a_request_whose_answer_dies_with_the_process_is_answered_when_it_comes_
                 service.kill();
                 service = Process::with(&data, &[], Some(&faults));
             }
-            let again = match send(&service).await {
-                Ok(again) => again,
+            let mut again = send(&service).await;
+            if again.is_err() {
                 // It answered the first time, and died of a sync of a worker's just after.
-                Err(_) => {
-                    service.kill();
-                    service = Process::with(&data, &[], Some(&faults));
-                    send(&service).await.unwrap()
-                }
-            };
+                service.kill();
+                service = Process::with(&data, &[], Some(&faults));
+                again = send(&service).await;
+            }
+            let again = again.unwrap();
             assert!([StatusCode::CREATED, StatusCode::ACCEPTED].contains(&again.status()), "{again:?}");
             let location = again.headers()["location"].to_str().unwrap().to_owned();
             let again: Value = again.json().await.unwrap();
