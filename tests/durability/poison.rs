@@ -99,7 +99,9 @@ async fn a_scan_at_which_every_process_falls_silent_is_set_aside() {
     let silent = service.accepted(&project, silent).await;
     let job = format!("/v1/jobs/{}", silent["job"]["id"].as_str().unwrap());
     let mut stopped = BTreeSet::new();
+    let begun = std::time::Instant::now();
     while service.json(&job).await["finished"].is_null() {
+        assert!(begun.elapsed() < std::time::Duration::from_mins(2), "a silent process keeps its job");
         for process in workers(&service).into_iter().filter(|process| works(*process)) {
             // One that has ended meanwhile cannot be stopped.
             let _ = std::process::Command::new("kill").arg("-STOP").arg(process.to_string()).output();
