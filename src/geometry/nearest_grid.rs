@@ -172,7 +172,11 @@ struct Frame {
 }
 
 /// The number of a point's brick and of its cell therein, as one number; for a point outside, the brick after the last.
-#[inline]
+#[expect(
+    clippy::inline_always,
+    reason = "apart from `places` it is compiled for the least processor, one point at a time"
+)]
+#[inline(always)]
 fn place(frame: &Frame, x: f32, y: f32, z: f32) -> u32 {
     let offset = |k: usize, x: f32| (x * frame.inverse).floor() - frame.low[k];
     let (x, y, z) = (offset(0, x), offset(1, y), offset(2, z));
