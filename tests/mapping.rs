@@ -160,6 +160,26 @@ fn the_model_is_the_same_at_one_and_at_two_threads() {
 }
 
 #[test]
+fn a_second_look_tells_the_ends_of_a_hall_apart() {
+    let building = BuildingOptions { layout: Layout::Hall, ..BuildingOptions::default() };
+    let truth = survey(building, 12, 104);
+    let waits = registered(&without_finer_surfaces(&truth)).snapshot();
+    assert!(waits.scans.values().all(|scan| matches!(scan, ScanOutcome::Waiting(_))));
+    let whole = registered(&truth).snapshot();
+    for scan in &truth.scans {
+        let (degrees, metres) = error(&whole, &truth, truth.scans[0].key, scan.key).expect("one component");
+        assert!(degrees < 2.0 && metres < 0.2, "{degrees} deg, {metres} m");
+    }
+}
+
+/// The same scans as if their data were no finer than their voxels.
+fn without_finer_surfaces(truth: &Truth) -> Truth {
+    let coarse =
+        |scan: &Arc<PreparedScan>| Arc::new(PreparedScan { fine: None, ..PreparedScan::clone(scan) });
+    Truth { scans: truth.scans.iter().map(coarse).collect(), poses: truth.poses.clone() }
+}
+
+#[test]
 fn colours_tell_the_ends_of_a_hall_apart_that_nothing_else_does() {
     let hall = |colored| {
         let building = BuildingOptions { layout: Layout::Hall, ..BuildingOptions::default() };

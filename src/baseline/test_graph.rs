@@ -89,19 +89,10 @@ fn says_nothing_of_triplets() -> SupportOptions {
 
 fn scan(k: usize) -> PreparedScan {
     PreparedScan {
-        key: ScanKey(k as u128),
         resolution: 0.05,
-        origin: [0.0; 3],
         points: vec![[0.5, 0.0, 1.0], [1.5, 0.5, 1.0]],
         normals: vec![[0.0, 0.0, 1.0]; 2],
-        colors: Vec::new(),
-        keypoints: Vec::new(),
-        descriptors: Vec::new(),
-        signature: Vec::new(),
-        range_image: None,
-        viewpoint: [0.0; 3],
-        hidden_share: 0.0,
-        up: None,
+        ..PreparedScan::empty(ScanKey(k as u128))
     }
 }
 

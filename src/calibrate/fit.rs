@@ -269,22 +269,9 @@ fn seen(result: &PairResult, view: View, pair: &Logistic, voxel: f64) -> PairRes
 
 /// As much of a scan as the scan graph reads.
 fn outline(scan: &ScanOutline, resolution: f64) -> Scan {
-    let prepared = PreparedScan {
-        key: scan.key,
-        resolution,
-        origin: [0.0; 3],
-        points: Vec::new(),
-        normals: Vec::new(),
-        colors: Vec::new(),
-        keypoints: Vec::new(),
-        descriptors: Vec::new(),
-        signature: Vec::new(),
-        range_image: None,
-        viewpoint: [0.0; 3],
-        hidden_share: 0.0,
-        up: None,
-    };
-    Scan { centroid: scan.centroid.into(), ..Scan::new(prepared) }
+    let mut outline = Scan::new(PreparedScan { resolution, ..PreparedScan::empty(scan.key) });
+    outline.centroid = scan.centroid.into();
+    outline
 }
 
 impl Label {

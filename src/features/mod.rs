@@ -2,6 +2,7 @@
 //! (voxel index, range image) that verification reads. Uses `cloud` and `geometry`; used by `pairwise` and above.
 
 mod color;
+mod fine;
 mod fpfh;
 mod keypoints;
 mod planes;
@@ -11,6 +12,7 @@ mod resolution;
 mod sensor;
 mod signature;
 
+pub use fine::FineSurface;
 pub use fpfh::{DESCRIPTOR_LEN, Descriptor, fpfh};
 pub use keypoints::select_keypoints;
 pub use planes::{Offsets, PlaneProfile};

@@ -1,10 +1,13 @@
 //! A scan made ready for matching: everything the pair and mapping layers read, in two forms. [`PreparedScan`] is plain data, to be
 //! stored; [`Scan`] adds the lookup grid, to be computed with.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use super::color::thinned_colors;
+use super::fine::{FineSurface, Unpacked};
 use super::fpfh::{Descriptor, fpfh};
 use super::keypoints::select_keypoints;
 use super::planes::PlaneProfile;
@@ -23,6 +26,8 @@ const MAX_POINTS: usize = 400_000;
 /// Radius of normals and of descriptors, in voxels.
 const NORMAL_RADIUS: f32 = 2.0;
 const DESCRIPTOR_RADIUS: f32 = 5.0;
+/// Half the voxel must give this many times the points, or there is nothing finer to be seen.
+const FINER: f64 = 1.6;
 
 /// How scans are prepared. Scans of one model must be prepared with equal options.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -103,6 +108,8 @@ pub struct PreparedScan {
     pub signature: Vec<f32>,
     /// What the sensor saw, when its position is known well enough.
     pub range_image: Option<RangeImage>,
+    /// Its surfaces at half the voxel, where the data are dense enough and there is a range image.
+    pub fine: Option<FineSurface>,
     /// Where the sensor stood, as far as known; normals face it. Metres, local frame.
     pub viewpoint: Point,
     /// Share of the points that are hidden from the viewpoint.
@@ -112,6 +119,27 @@ pub struct PreparedScan {
 }
 
 impl PreparedScan {
+    /// A scan of which nothing is known but who it is.
+    #[must_use]
+    pub fn empty(key: ScanKey) -> Self {
+        Self {
+            key,
+            resolution: 0.0,
+            origin: [0.0; 3],
+            points: Vec::new(),
+            normals: Vec::new(),
+            colors: Vec::new(),
+            keypoints: Vec::new(),
+            descriptors: Vec::new(),
+            signature: Vec::new(),
+            range_image: None,
+            fine: None,
+            viewpoint: [0.0; 3],
+            hidden_share: 0.0,
+            up: None,
+        }
+    }
+
     /// As bytes for a blob.
     pub fn to_bytes(&self) -> Result<Vec<u8>, postcard::Error> {
         postcard::to_stdvec(self)
@@ -142,6 +170,7 @@ pub struct Scan {
     pub rms_radius: f64,
     /// Its planes, where its normals concentrate in three orthogonal directions.
     pub planes: Option<PlaneProfile>,
+    unpacked: Unpacked,
 }
 
 impl Scan {
@@ -154,7 +183,19 @@ impl Scan {
         let centroid = prepared.points.iter().map(position).sum::<Vector3<f64>>() / n;
         let square = prepared.points.iter().map(|p| (position(p) - centroid).norm_squared()).sum::<f64>() / n;
         let planes = PlaneProfile::of(&prepared.points, &prepared.normals, prepared.resolution as f32);
-        Self { prepared, grid, centroid, rms_radius: square.sqrt(), planes }
+        Self { prepared, grid, centroid, rms_radius: square.sqrt(), planes, unpacked: Unpacked::default() }
+    }
+
+    /// The same scan at half the voxel, surfaces alone; `None` where the data are no finer. It stays in memory until
+    /// [`Scan::forget_fine`].
+    #[must_use]
+    pub fn fine(&self) -> Option<Arc<Self>> {
+        self.unpacked.get(&self.prepared)
+    }
+
+    /// Gives back the memory that [`Scan::fine`] took.
+    pub fn forget_fine(&self) {
+        self.unpacked.forget();
     }
 
     /// Which scan.
@@ -215,6 +256,12 @@ pub fn prepare(
     if points.len() < MIN_POINTS {
         return Err(PrepareError::TooFewPoints { found: points.len(), needed: MIN_POINTS, resolution });
     }
+    let fine_surface = view
+        .range_image
+        .as_ref()
+        .and_then(|_| fine_surface(cloud, &view.position, &fine, v))
+        .filter(|finer| finer.len() as f64 > FINER * points.len() as f64);
+    control.check()?;
     let all = fpfh(&points, &normals, DESCRIPTOR_RADIUS * v);
     control.check()?;
     let mut rng = options.seed.derive("keypoints", key.0);
@@ -233,8 +280,24 @@ pub fn prepare(
         descriptors,
         signature,
         range_image: view.range_image,
+        fine: fine_surface,
         viewpoint: view.position,
         hidden_share: view.hidden_share,
         up: stance.up.and_then(|up| Some(Vector3::from(up).try_normalize(f64::MIN_POSITIVE)?.into())),
     })
+}
+
+/// The surfaces at the voxels of half the size that `fine` fills (metres, local frame), seen from the viewpoint.
+fn fine_surface(cloud: &PointCloud, viewpoint: &Point, fine: &[Point], v: f32) -> Option<FineSurface> {
+    // As for the scan itself, what is half as large again carries the normals and the range image.
+    let finer = voxel_centroids(&cloud.points, v / 4.0);
+    let reach = NORMAL_RADIUS * v / 2.0;
+    let normals = normals(fine, &finer, &NeighborIndex::new(&finer, reach), reach);
+    let (points, normals): (Vec<Point>, Vec<Point>) = fine
+        .iter()
+        .zip(normals)
+        .filter_map(|(point, normal)| normal.map(|n| (*point, face(n, point, viewpoint))))
+        .unzip();
+    let (range_image, _) = RangeImage::render(&finer, *viewpoint, v / 2.0);
+    (!points.is_empty()).then(|| FineSurface::new(&points, &normals, range_image))
 }

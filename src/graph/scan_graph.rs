@@ -163,6 +163,13 @@ impl ScanGraph {
         Ok(results)
     }
 
+    /// Gives back the memory that second looks took ([`Scan::fine`]).
+    pub fn forget_fine(&self) {
+        for scan in self.scans.values() {
+            scan.forget_fine();
+        }
+    }
+
     /// Adds results of pairs whose scans are both there.
     pub fn add_results(&mut self, results: impl IntoIterator<Item = PairResult>, options: &SupportOptions) {
         let mut touched = BTreeSet::new();

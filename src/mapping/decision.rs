@@ -155,8 +155,8 @@ impl Decisions {
         a_from_b: &Pose,
         options: &MappingOptions,
     ) -> bool {
-        let mut all = self.list.iter().chain(&self.taken_back);
-        all.any(|decision| rules_out(decision, graph, (a, b), a_from_b, options))
+        self.client_forbids(graph, a, b, a_from_b, options)
+            || self.taken_back.iter().any(|ban| rules_out(ban, graph, (a, b), a_from_b, options))
     }
 
     /// Whether a client's ban does.

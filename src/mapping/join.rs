@@ -2,6 +2,7 @@
 //! a dense alignment to the verdict on everything that overlaps.
 
 use std::cell::OnceCell;
+use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
@@ -12,15 +13,18 @@ use super::component::Component;
 use super::gravity::Gravity;
 use super::options::{JoinLevel, MappingOptions};
 use super::surfaces::{align, judge, judge_inside};
+use crate::cloud::ScanKey;
 use crate::geometry::{Kernel, Pose, rigid_fit};
 use crate::graph::ScanGraph;
-use crate::pairwise::{Counts, inlier_matches};
+use crate::pairwise::{Contrast, Counts, inlier_matches, look_finely};
 
 const FIT_ITERATIONS: usize = 5;
 /// Firm support allows this many times the usual violation, at most.
 const FIRM_LENIENCE: f64 = 1.5;
 /// Of the points that are near the other side, at most this share may face another way. Right joins of components show up to 0.3.
 const MAX_WRONG_NORMAL: f64 = 0.38;
+/// Pairs of each of two poses that a second look is taken at, the firmest.
+const SECOND_LOOKS: usize = 6;
 /// Edges whose own poses are tried where the fit to all of them fails.
 pub const SINGLE_STARTS: usize = 6;
 
@@ -169,7 +173,10 @@ pub fn weigh_join(
                     .iter()
                     .enumerate()
                     .filter(|(other, c)| *other != rank && margin(c.doubt) < level.support)
-                    .find(|(_, c)| place(c, 0.0, 0).is_ok());
+                    .find(|(_, c)| {
+                        place(c, 0.0, 0)
+                            .is_ok_and(|rival| !outdone(graph, (a, b), (candidate, &placed), (c, &rival)))
+                    });
                 return match rival {
                     Some((_, c)) => Err(Refusal::Rival { support: placed.support, rival: c.doubt }),
                     None => Ok(placed.a_from_b),
@@ -179,6 +186,35 @@ pub fn weigh_join(
         }
     }
     Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support }))
+}
+
+/// Whether a second look at the pairs that speak for either of two poses finds the rival's clearly worse.
+fn outdone(
+    graph: &ScanGraph,
+    (a, b): (&Component, &Component),
+    (candidate, placed): (&Candidate, &Placed),
+    (rival, rivals): (&Candidate, &Placed),
+) -> bool {
+    let firmest = |c: &Candidate| {
+        let mut members: Vec<(f64, ScanKey, ScanKey)> =
+            c.members.iter().map(|m| (m.doubt, m.in_a, m.in_b)).collect();
+        members.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+        members.into_iter().take(SECOND_LOOKS).map(|(_, in_a, in_b)| (in_a, in_b))
+    };
+    let pairs: BTreeSet<(ScanKey, ScanKey)> = firmest(candidate).chain(firmest(rival)).collect();
+    let (mut mine, mut others) = (Counts::default(), Counts::default());
+    for (in_a, in_b) in pairs {
+        let (Some(x), Some(y)) = (graph.scan(in_a), graph.scan(in_b)) else { continue };
+        let (Some(a_from_x), Some(b_from_y)) = (a.poses.get(&in_a), b.poses.get(&in_b)) else { continue };
+        let between = |a_from_b: &Pose| a_from_x.inverse() * *a_from_b * *b_from_y;
+        if let (Some(at_mine), Some(at_others)) =
+            (look_finely(x, y, &between(&placed.a_from_b)), look_finely(x, y, &between(&rivals.a_from_b)))
+        {
+            mine = mine.plus(&at_mine);
+            others = others.plus(&at_others);
+        }
+    }
+    mine.points > 0 && Contrast::between(&mine, &others).is_decisive()
 }
 
 /// The share of judged points that speak against a pose: in free space, or all of them where surfaces cross instead of coinciding,

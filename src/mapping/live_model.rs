@@ -226,7 +226,10 @@ impl LiveModel {
 
     fn grow(&mut self, control: Control<'_>) -> Result<(), Cancelled> {
         let voxel = self.voxel();
-        grow(&mut self.mapper, &mut self.graph, voxel, &self.options, &mut self.new_pairs, control)
+        let grown =
+            grow(&mut self.mapper, &mut self.graph, voxel, &self.options, &mut self.new_pairs, control);
+        self.graph.forget_fine();
+        grown
     }
 
     /// Runs an operation on every component and keeps, component by component, what improves the held-out measure.

@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::bent_join::bent_join;
 use super::candidates::{CLUSTERS, Candidate, candidates};
 use super::component::Component;
-use super::consistency::{loose_side, supports};
+use super::consistency::supports;
+use super::cuts::loose_side;
 use super::guarded::{guarded, refined};
 use super::initial_pair::initial_pairs;
 use super::join::{Refusal, weigh_join};
@@ -13,6 +14,7 @@ use super::next_scan::visible_landmarks;
 use super::open_join::{OpenJoin, Undone, open_joins};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{Reach, dense, local_bundle_adjustment, neighborhood};
+use super::refusals::{Link, Refusals, Refused, more_telling};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::{Retrieval, ScanGraph};
@@ -29,17 +31,6 @@ struct NextScan {
     visible: (usize, usize),
 }
 
-/// A join that was weighed and not made.
-#[derive(Debug, Clone, Copy)]
-struct Refused {
-    /// The support it had.
-    support: f64,
-    /// What the level asked for.
-    needed: f64,
-    /// Why.
-    refusal: Refusal,
-}
-
 /// The state of mapping: components, and scans that wait.
 #[derive(Debug, Clone, Default)]
 pub struct Mapper {
@@ -48,7 +39,7 @@ pub struct Mapper {
     /// Scans in no component, and why as far as known.
     pub waiting: BTreeMap<ScanKey, Option<Refusal>>,
     /// Joins that were refused on sight of the surfaces: not worth another look until the support or the surfaces change.
-    refused: BTreeMap<(ScanKey, ScanKey), Refused>,
+    refused: Refusals,
     /// How often each scan was filtered out, so that filtering ends.
     pub(super) filtered: BTreeMap<ScanKey, usize>,
     /// Joins since the whole model was refined last.
@@ -83,7 +74,7 @@ impl Mapper {
         self.doubted.remove(&scan);
         self.open_joins.retain(|open| open.a != scan && open.b != scan);
         self.undone.retain(|undone| !undone.scans.contains(&scan) && !undone.evidence.contains(&scan));
-        self.refused.retain(|(x, y), _| *x != scan && *y != scan);
+        self.refused.forget(scan);
         for component in &mut self.components {
             component.remove(scan, options);
         }
@@ -103,8 +94,8 @@ impl Mapper {
             control.check()?;
             let component = &self.components[next.component];
             let single = Component::single(next.scan);
-            let link = (component.gauge, next.scan);
-            if self.already_refused(link, next.support, level) {
+            let link = Link::between(component.gauge, next.scan);
+            if self.refused.still_holds(link, next.support, level) {
                 continue;
             }
             match weigh_join(graph, component, &single, &next.candidates, level, voxel, options) {
@@ -151,7 +142,7 @@ impl Mapper {
                 let support = best.support;
                 if support < level.support {
                     let refusal = Refusal::Support { found: support, needed: level.support };
-                    self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
+                    self.waiting.entry(scan).and_modify(|known| *known = more_telling(*known, refusal));
                 } else {
                     let visible = visible_landmarks(graph, component, scan, best);
                     let visible = (visible.score, visible.keypoints.len());
@@ -184,8 +175,8 @@ impl Mapper {
             let (mut a, b) = (Component::single(first), Component::single(second));
             let candidates = candidates(graph, &a, &b, voxel, options, CLUSTERS);
             let Some(support) = candidates.first().map(|best| best.support) else { continue };
-            let link = (first.min(second), first.max(second));
-            if self.already_refused(link, support, level) {
+            let link = Link::between(first, second);
+            if self.refused.still_holds(link, support, level) {
                 continue;
             }
             match weigh_join(graph, &a, &b, &candidates, level, voxel, options) {
@@ -200,7 +191,7 @@ impl Mapper {
                 Err(refusal) => {
                     self.refused.insert(link, Refused { support, needed: level.support, refusal });
                     for scan in [first, second] {
-                        self.waiting.entry(scan).and_modify(|known| *known = worse(*known, refusal));
+                        self.waiting.entry(scan).and_modify(|known| *known = more_telling(*known, refusal));
                     }
                 }
             }
@@ -246,9 +237,9 @@ impl Mapper {
         ranked.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
         for (_, a, b, candidates) in ranked {
             control.check()?;
-            let link = (self.components[a].gauge, self.components[b].gauge);
+            let link = Link::between(self.components[a].gauge, self.components[b].gauge);
             let Some(candidate) = candidates.first() else { continue };
-            if self.already_refused(link, candidate.support, level) {
+            if self.refused.still_holds(link, candidate.support, level) {
                 continue;
             }
             let (first, second) = (&self.components[a], &self.components[b]);
@@ -401,16 +392,9 @@ impl Mapper {
         if self.components[j].len() > self.components[i].len() { (j, i) } else { (i, j) }
     }
 
-    fn already_refused(&self, link: (ScanKey, ScanKey), support: f64, level: &JoinLevel) -> bool {
-        self.refused.get(&link).is_some_and(|r| {
-            (support - r.support).abs() < 0.05 * r.support.abs() && level.support >= r.needed
-        })
-    }
-
     /// Why two pieces were not joined when they were weighed last, if they were.
     pub(super) fn refusal_between(&self, a: &Component, b: &Component) -> Option<Refusal> {
-        let known = |x: ScanKey, y: ScanKey| self.refused.get(&(x, y));
-        known(a.gauge, b.gauge).or_else(|| known(b.gauge, a.gauge)).map(|refused| refused.refusal)
+        self.refused.get(Link::between(a.gauge, b.gauge))
     }
 
     pub(super) fn dissolve_small(&mut self) {
@@ -420,23 +404,5 @@ impl Mapper {
         for scan in small.into_iter().flat_map(|c| c.poses.into_keys()) {
             self.add_waiting(scan);
         }
-    }
-}
-
-/// The refusal that says more: a violation or a rival over mere lack of support, and more support over less.
-fn worse(known: Option<Refusal>, new: Refusal) -> Option<Refusal> {
-    match (known, new) {
-        (Some(Refusal::Support { found, .. }), Refusal::Support { found: now, .. }) if now < found => known,
-        (Some(Refusal::Contradicted { .. }), _)
-        | (
-            Some(
-                Refusal::Violation { .. }
-                | Refusal::Rival { .. }
-                | Refusal::Forbidden
-                | Refusal::SinglePair { .. },
-            ),
-            Refusal::Support { .. },
-        ) => known,
-        _ => Some(new),
     }
 }

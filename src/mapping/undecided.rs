@@ -7,9 +7,10 @@ use std::collections::BTreeSet;
 
 use super::candidates::{CLUSTERS, candidates};
 use super::component::Component;
-use super::consistency::{CLEARLY_DIFFERENT, Contradiction, Testimony, smaller_side};
+use super::cuts::smaller_side;
 use super::join::{Refusal, weigh_join};
 use super::options::{JoinLevel, MappingOptions};
+use super::testimony::{CLEARLY_DIFFERENT, Contradiction, Testimony};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;

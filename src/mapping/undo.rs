@@ -7,13 +7,15 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::candidates::best_candidate;
 use super::component::Component;
-use super::consistency::{Contradiction, Testimony, separating_cut, smaller_side, supports, testimony};
+use super::consistency::supports;
+use super::cuts::{separating_cut, smaller_side};
 use super::decision::{Decision, between_own_frames};
 use super::intrusion::{Intrusion, intrusion};
 use super::join::Refusal;
 use super::mapper::Mapper;
 use super::open_join::Undone;
 use super::options::MappingOptions;
+use super::testimony::{Contradiction, Testimony, testimony};
 use super::undecided::{Undecided, undecided};
 use super::voice::{Word, one_voice};
 use crate::cloud::ScanKey;
@@ -61,7 +63,9 @@ impl Mapper {
                 continue;
             }
             let supports = supports(graph, &component, options);
-            let testimony = testimony(graph, &self.with_torn(graph, &component, voxel, options), options);
+            let asked = self.with_torn(graph, &component, voxel, options);
+            let mut testimony = testimony(graph, &asked, options);
+            testimony.cross_examine(graph, &asked, options, control)?;
             match finding(graph, &component, &supports, &testimony, voxel, options, control)? {
                 Finding::Sound => self.components.push(component),
                 Finding::Folded { strongest } => {

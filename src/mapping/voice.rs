@@ -1,13 +1,13 @@
 //! Which of the pairs that contradict a component say the same. Where alike places were taken for one, all who see it are for the same
-//! motion of the one place away from the other; pairs that are wrong by chance each say something else. Used by `consistency` and `undo`.
+//! motion of the one place away from the other; pairs that are wrong by chance each say something else. Used by `testimony` and `undo`.
 
 use std::collections::BTreeSet;
 
 use nalgebra::Vector3;
 
 use super::component::Component;
-use super::consistency::Contradiction;
 use super::options::MappingOptions;
+use super::testimony::Contradiction;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 use crate::graph::ScanGraph;

@@ -179,7 +179,12 @@ pub fn prepared(mut input: &[u8]) -> String {
             assert!(scan.normals.iter().flatten().all(|x| x.is_finite()));
             assert!(scan.colors.is_empty() || scan.colors.len() == scan.points.len());
             assert!(scan.descriptors.iter().all(|x| x.is_finite()));
-            let planes = Scan::new(scan).planes.is_some();
+            let scan = Scan::new(scan);
+            if let Some(finer) = scan.fine() {
+                assert!(finer.prepared.points.iter().flatten().all(|x| x.is_finite()));
+                assert!(finer.prepared.normals.iter().flatten().all(|x| x.is_finite()));
+            }
+            let planes = scan.planes.is_some();
             format!("prepared, planes {planes}")
         }
         Err(error) => error.to_string(),

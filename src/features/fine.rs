@@ -1,0 +1,161 @@
+//! The surfaces of a scan at half its voxel, for second looks: where two poses of a pair both look right, what tells them apart is often
+//! smaller than a voxel. Few pairs need it, so it is kept packed, and unpacked while pairs are matched.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use serde::{Deserialize, Serialize};
+
+use super::prepared::{PreparedScan, Scan};
+use super::range_image::RangeImage;
+use crate::geometry::Point;
+
+/// A direction of length 1 in packed form.
+const UNIT: f32 = 127.0;
+/// Steps that a coordinate can make.
+const STEPS: f32 = 65_535.0;
+
+/// Points with normals in nine bytes each, and what the sensor saw, all at half the voxel of the scan.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct FineSurface {
+    /// Least coordinates, metres, local frame.
+    low: Point,
+    /// A step of a packed coordinate, metres.
+    step: f32,
+    surfels: Vec<Surfel>,
+    range_image: RangeImage,
+}
+
+/// A point in steps from the lowest, and the direction that its surface faces.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+struct Surfel {
+    position: [u16; 3],
+    normal: [i8; 3],
+}
+
+impl FineSurface {
+    /// Packs points (metres, local frame) with their unit normals: positions to 1 / 65,535 of the longest edge of their box, normals to
+    /// half a degree.
+    #[must_use]
+    pub fn new(points: &[Point], normals: &[Point], range_image: RangeImage) -> Self {
+        let least = |k: usize| points.iter().map(|p| p[k]).fold(f32::INFINITY, f32::min);
+        let most = |k: usize| points.iter().map(|p| p[k]).fold(f32::NEG_INFINITY, f32::max);
+        let low: Point = std::array::from_fn(least);
+        let longest = (0..3).map(|k| most(k) - low[k]).fold(0.0, f32::max);
+        let step = (longest / STEPS).max(f32::MIN_POSITIVE);
+        let surfels = points.iter().zip(normals).map(|(point, normal)| Surfel {
+            position: std::array::from_fn(|k| ((point[k] - low[k]) / step).round() as u16),
+            normal: normal.map(|x| (x * UNIT).round() as i8),
+        });
+        Self { low, step, surfels: surfels.collect(), range_image }
+    }
+
+    /// Points on it.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.surfels.len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.surfels.is_empty()
+    }
+
+    /// The same scan with these surfaces, without keypoints and all that belongs to them.
+    fn unpack(&self, of: &PreparedScan) -> Scan {
+        let (points, normals): (Vec<Point>, Vec<Point>) = self
+            .surfels
+            .iter()
+            .map(|surfel| {
+                let normal = surfel.normal.map(f32::from);
+                let length = normal.iter().map(|x| x * x).sum::<f32>().sqrt().max(1.0);
+                let point: Point =
+                    std::array::from_fn(|k| self.low[k] + f32::from(surfel.position[k]) * self.step);
+                (point, normal.map(|x| x / length))
+            })
+            .unzip();
+        Scan::new(PreparedScan {
+            resolution: of.resolution / 2.0,
+            origin: of.origin,
+            points,
+            normals,
+            range_image: Some(self.range_image.clone()),
+            viewpoint: of.viewpoint,
+            hidden_share: of.hidden_share,
+            up: of.up,
+            ..PreparedScan::empty(of.key)
+        })
+    }
+}
+
+/// A scan's finer self, from when it is first asked for until it is forgotten. Clones start without.
+#[derive(Debug, Default)]
+pub(super) struct Unpacked(Mutex<Option<Arc<Scan>>>);
+
+impl Clone for Unpacked {
+    fn clone(&self) -> Self {
+        Self::default()
+    }
+}
+
+impl Unpacked {
+    /// The finer scan; `None` where the data are no finer.
+    pub fn get(&self, prepared: &PreparedScan) -> Option<Arc<Scan>> {
+        let surface = prepared.fine.as_ref()?;
+        let known = self.0.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        // Two threads may unpack it at once, and come to the same.
+        Some(known.unwrap_or_else(|| {
+            let scan = Arc::new(surface.unpack(prepared));
+            *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::clone(&scan));
+            scan
+        }))
+    }
+
+    /// Gives its memory back.
+    pub fn forget(&self) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_packed_comes_out_as_it_went_in() {
+        let points: Vec<Point> = (0..3000)
+            .map(|i| {
+                let i = i as f32;
+                [(0.37 * i).sin() * 9.0 - 3.0, (0.11 * i).cos() * 4.0 + 100.0, 0.001 * i]
+            })
+            .collect();
+        let normals: Vec<Point> = points
+            .iter()
+            .map(|p| {
+                let length = p.iter().map(|x| x * x).sum::<f32>().sqrt();
+                p.map(|x| x / length)
+            })
+            .collect();
+        let (image, _) = RangeImage::render(&points, [0.0; 3], 0.1);
+        let surface = FineSurface::new(&points, &normals, image);
+        let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(crate::cloud::ScanKey(1)) };
+        let scan = surface.unpack(&of);
+        assert!((scan.prepared.resolution - 0.1).abs() < 1e-12);
+        for (i, (point, normal)) in points.iter().zip(&normals).enumerate() {
+            for k in 0..3 {
+                assert!((point[k] - scan.prepared.points[i][k]).abs() < 18.0 / STEPS);
+                assert!((normal[k] - scan.prepared.normals[i][k]).abs() < 0.01);
+            }
+        }
+    }
+
+    #[test]
+    fn a_surface_of_one_point_or_none_is_packed_too() {
+        let (image, _) = RangeImage::render(&[[1.0, 0.0, 0.0]], [0.0; 3], 0.1);
+        let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(crate::cloud::ScanKey(1)) };
+        let none = FineSurface::new(&[], &[], image.clone());
+        assert!(none.is_empty() && none.unpack(&of).prepared.points.is_empty());
+        let one = FineSurface::new(&[[1.0, 2.0, 3.0]], &[[0.0, 0.0, 1.0]], image);
+        assert_eq!(one.unpack(&of).prepared.points, [[1.0, 2.0, 3.0]]);
+    }
+}

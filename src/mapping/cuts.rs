@@ -1,0 +1,218 @@
+//! Cuts through the support that holds a component together: the weakest, and the weakest between two scans.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use super::component::Component;
+use crate::cloud::ScanKey;
+
+/// Support below this is none.
+const NO_SUPPORT: f64 = 1e-6;
+
+/// A side that hangs on the rest of a component by less than `least` support, at its weakest cut: the side with fewer scans (Stoer, Wagner:
+/// "A simple min-cut algorithm", JACM 1997). `None` if there is none. Scans that a single pair holds by as much are never parted, so they
+/// count as one: of a component that holds together well nothing is left to be cut.
+#[must_use]
+pub fn loose_side(
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    least: f64,
+) -> Option<BTreeSet<ScanKey>> {
+    let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
+    let index: BTreeMap<ScanKey, usize> = keys.iter().enumerate().map(|(i, key)| (*key, i)).collect();
+    let links =
+        || supports.iter().filter_map(|((a, b), support)| Some((*index.get(a)?, *index.get(b)?, *support)));
+    let groups = tied(keys.len(), links().filter(|(_, _, support)| *support >= least));
+    let mut group_of = vec![0; keys.len()];
+    for (group, members) in groups.iter().enumerate() {
+        for scan in members {
+            group_of[*scan] = group;
+        }
+    }
+    let n = groups.len();
+    let mut weight = vec![vec![0.0_f64; n]; n];
+    for (a, b, support) in links() {
+        let (i, j) = (group_of[a], group_of[b]);
+        if i != j {
+            weight[i][j] += support;
+            weight[j][i] += support;
+        }
+    }
+    let (side, cut) = weakest_cut(weight, groups)?;
+    let side: BTreeSet<ScanKey> = side.into_iter().map(|i| keys[i]).collect();
+    (cut < least).then(|| smaller_side(component, side))
+}
+
+/// The same cut by the side with fewer scans.
+#[must_use]
+pub fn smaller_side(component: &Component, side: BTreeSet<ScanKey>) -> BTreeSet<ScanKey> {
+    if 2 * side.len() > component.len() {
+        component.poses.keys().filter(|key| !side.contains(key)).copied().collect()
+    } else {
+        side
+    }
+}
+
+/// Groups of `n` scans that these links tie to each other.
+fn tied(n: usize, links: impl Iterator<Item = (usize, usize, f64)>) -> Vec<Vec<usize>> {
+    let mut neighbors: Vec<Vec<usize>> = vec![Vec::new(); n];
+    for (a, b, _) in links {
+        neighbors[a].push(b);
+        neighbors[b].push(a);
+    }
+    let mut seen = vec![false; n];
+    let mut groups = Vec::new();
+    for first in 0..n {
+        if std::mem::replace(&mut seen[first], true) {
+            continue;
+        }
+        let mut group = vec![first];
+        let mut at = 0;
+        while let Some(scan) = group.get(at).copied() {
+            at += 1;
+            for other in &neighbors[scan] {
+                if !std::mem::replace(&mut seen[*other], true) {
+                    group.push(*other);
+                }
+            }
+        }
+        groups.push(group);
+    }
+    groups
+}
+
+/// The weakest cut through groups that hold together by `weight`: the members on one side, and the weight across. `None` for fewer than
+/// two groups.
+fn weakest_cut(mut weight: Vec<Vec<f64>>, mut groups: Vec<Vec<usize>>) -> Option<(Vec<usize>, f64)> {
+    let n = groups.len();
+    let mut alive: Vec<usize> = (0..n).collect();
+    let mut best: Option<(Vec<usize>, f64)> = None;
+    while alive.len() > 1 {
+        let mut tied = vec![0.0_f64; n];
+        let mut left = alive.clone();
+        let mut last = (left[0], left[0]);
+        let mut cut = 0.0;
+        while !left.is_empty() {
+            let at =
+                (0..left.len()).max_by(|&x, &y| tied[left[x]].total_cmp(&tied[left[y]]).then(y.cmp(&x)))?;
+            let next = left.remove(at);
+            last = (last.1, next);
+            cut = tied[next];
+            for &other in &left {
+                tied[other] += weight[next][other];
+            }
+        }
+        let (kept, merged) = last;
+        if best.as_ref().is_none_or(|(_, least)| cut < *least) {
+            best = Some((groups[merged].clone(), cut));
+        }
+        let moved = std::mem::take(&mut groups[merged]);
+        groups[kept].extend(moved);
+        for other in 0..n {
+            let extra = weight[merged][other];
+            weight[kept][other] += extra;
+            weight[other][kept] += extra;
+        }
+        weight[kept][kept] = 0.0;
+        alive.retain(|i| *i != merged);
+    }
+    best
+}
+
+/// The cut of least support that separates two scans of a component: the side of `from`, and the support across (Edmonds, Karp:
+/// "Theoretical improvements in algorithmic efficiency for network flow problems", JACM 1972).
+#[must_use]
+pub fn separating_cut(
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    from: ScanKey,
+    to: ScanKey,
+) -> Option<(BTreeSet<ScanKey>, f64)> {
+    let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
+    let index: BTreeMap<ScanKey, usize> = keys.iter().enumerate().map(|(i, key)| (*key, i)).collect();
+    let (&source, &sink) = (index.get(&from)?, index.get(&to)?);
+    let n = keys.len();
+    let mut spare = vec![0.0_f64; n * n];
+    for ((a, b), support) in supports {
+        if let (Some(&i), Some(&j)) = (index.get(a), index.get(b)) {
+            spare[i * n + j] += support;
+            spare[j * n + i] += support;
+        }
+    }
+    let mut flow = 0.0;
+    loop {
+        let mut before: Vec<Option<usize>> = vec![None; n];
+        before[source] = Some(source);
+        let mut queue = VecDeque::from([source]);
+        while let Some(i) = queue.pop_front() {
+            for j in 0..n {
+                if before[j].is_none() && spare[i * n + j] > NO_SUPPORT {
+                    before[j] = Some(i);
+                    queue.push_back(j);
+                }
+            }
+        }
+        if before[sink].is_none() {
+            let side = (0..n).filter(|i| before[*i].is_some()).map(|i| keys[i]).collect();
+            return Some((side, flow));
+        }
+        let mut path = Vec::new();
+        let mut at = sink;
+        while at != source {
+            let previous = before[at]?;
+            path.push((previous, at));
+            at = previous;
+        }
+        let least = path.iter().map(|(i, j)| spare[i * n + j]).fold(f64::INFINITY, f64::min);
+        for (i, j) in path {
+            spare[i * n + j] -= least;
+            spare[j * n + i] += least;
+        }
+        flow += least;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose;
+    use crate::mapping::tracks::Tracks;
+
+    fn six() -> Component {
+        Component {
+            gauge: ScanKey(1),
+            poses: (1..=6).map(|k| (ScanKey(k), Pose::identity())).collect(),
+            tracks: Tracks::default(),
+        }
+    }
+
+    #[test]
+    fn two_scans_are_separated_where_least_holds_them_together() {
+        let key = ScanKey;
+        let links =
+            [(1, 2, 5.0), (2, 3, 5.0), (1, 3, 5.0), (4, 5, 6.0), (5, 6, 0.1), (4, 6, 0.1), (3, 4, 1.5)];
+        let supports = links.iter().map(|&(a, b, w)| ((key(a), key(b)), w)).collect();
+        let (side, cut) = separating_cut(&six(), &supports, key(1), key(5)).unwrap();
+        assert_eq!(side, BTreeSet::from([key(1), key(2), key(3)]));
+        assert!((cut - 1.5).abs() < 1e-9);
+        let (side, cut) = separating_cut(&six(), &supports, key(6), key(1)).unwrap();
+        assert_eq!(side, BTreeSet::from([key(6)]));
+        assert!((cut - 0.2).abs() < 1e-9);
+    }
+
+    #[test]
+    fn what_hangs_on_the_rest_by_little_is_found() {
+        let key = ScanKey;
+        let component = six();
+        // Two triangles joined by a light edge and a lighter one.
+        let links =
+            [(1, 2, 5.0), (2, 3, 5.0), (1, 3, 5.0), (4, 5, 6.0), (5, 6, 6.0), (3, 4, 1.5), (2, 5, 0.5)];
+        let supports = links.iter().map(|&(a, b, w)| ((key(a), key(b)), w)).collect();
+        // Both at once are more than 1.9 and less than 2.1; no scan of a triangle hangs on by so little.
+        assert_eq!(loose_side(&component, &supports, 1.9), None);
+        let side = loose_side(&component, &supports, 2.1).expect("the triangles hang on each other by 2");
+        assert!(
+            side == BTreeSet::from([key(1), key(2), key(3)])
+                || side == BTreeSet::from([key(4), key(5), key(6)])
+        );
+    }
+}
