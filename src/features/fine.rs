@@ -1,5 +1,5 @@
 //! The surfaces of a scan at half its voxel, for second looks: where two poses of a pair both look right, what tells them apart is often
-//! smaller than a voxel. Few pairs need it, so it is kept packed, and unpacked while pairs are matched.
+//! smaller than a voxel. Few pairs need it, so its points are kept packed, and unpacked while joins are weighed and pairs that contradict are heard.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -13,8 +13,12 @@ use crate::geometry::Point;
 const UNIT: f32 = 127.0;
 /// Steps that a coordinate can make.
 const STEPS: f32 = 65_535.0;
+/// A step is at most this share of the fine voxel, or packing would show.
+const LARGEST_STEP: f32 = 1.0 / 32.0;
+/// Points on it, at most: as many voxels as a scan may fill.
+const MOST: usize = super::prepared::MAX_POINTS;
 
-/// Points with normals in nine bytes each, and what the sensor saw, all at half the voxel of the scan.
+/// Points with normals in ten bytes each, and what the sensor saw, all at half the voxel of the scan.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct FineSurface {
     /// Least coordinates, metres, local frame.
@@ -33,32 +37,35 @@ struct Surfel {
 }
 
 impl FineSurface {
-    /// Packs points (metres, local frame) with their unit normals: positions to 1 / 65,535 of the longest edge of their box, normals to
-    /// half a degree.
+    /// Packs points (metres, local frame) with their unit normals: positions in steps of 1 / 65,535 of the longest edge of their box,
+    /// normals to half a degree. `None` without points, with far too many, and where something lies so far off that a step would be more
+    /// than 1/32 of the fine voxel (`resolution`, metres).
     #[must_use]
-    pub fn new(points: &[Point], normals: &[Point], range_image: RangeImage) -> Self {
+    pub fn new(
+        points: &[Point],
+        normals: &[Point],
+        range_image: RangeImage,
+        resolution: f32,
+    ) -> Option<Self> {
         let least = |k: usize| points.iter().map(|p| p[k]).fold(f32::INFINITY, f32::min);
         let most = |k: usize| points.iter().map(|p| p[k]).fold(f32::NEG_INFINITY, f32::max);
         let low: Point = std::array::from_fn(least);
         let longest = (0..3).map(|k| most(k) - low[k]).fold(0.0, f32::max);
         let step = (longest / STEPS).max(f32::MIN_POSITIVE);
+        if points.is_empty() || points.len() > MOST || step > LARGEST_STEP * resolution {
+            return None;
+        }
         let surfels = points.iter().zip(normals).map(|(point, normal)| Surfel {
             position: std::array::from_fn(|k| ((point[k] - low[k]) / step).round() as u16),
             normal: normal.map(|x| (x * UNIT).round() as i8),
         });
-        Self { low, step, surfels: surfels.collect(), range_image }
+        Some(Self { low, step, surfels: surfels.collect(), range_image })
     }
 
     /// Points on it.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.surfels.len()
-    }
-
-    /// Whether there are none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.surfels.is_empty()
     }
 
     /// The same scan with these surfaces, without keypoints and all that belongs to them.
@@ -137,25 +144,27 @@ mod tests {
             })
             .collect();
         let (image, _) = RangeImage::render(&points, [0.0; 3], 0.1);
-        let surface = FineSurface::new(&points, &normals, image);
+        let surface = FineSurface::new(&points, &normals, image, 0.1).expect("a step is small");
         let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(crate::cloud::ScanKey(1)) };
         let scan = surface.unpack(&of);
         assert!((scan.prepared.resolution - 0.1).abs() < 1e-12);
         for (i, (point, normal)) in points.iter().zip(&normals).enumerate() {
             for k in 0..3 {
-                assert!((point[k] - scan.prepared.points[i][k]).abs() < 18.0 / STEPS);
+                assert!((point[k] - scan.prepared.points[i][k]).abs() < 0.51 * 18.0 / STEPS);
                 assert!((normal[k] - scan.prepared.normals[i][k]).abs() < 0.01);
             }
         }
     }
 
     #[test]
-    fn a_surface_of_one_point_or_none_is_packed_too() {
+    fn what_cannot_be_packed_well_is_not_packed() {
         let (image, _) = RangeImage::render(&[[1.0, 0.0, 0.0]], [0.0; 3], 0.1);
         let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(crate::cloud::ScanKey(1)) };
-        let none = FineSurface::new(&[], &[], image.clone());
-        assert!(none.is_empty() && none.unpack(&of).prepared.points.is_empty());
-        let one = FineSurface::new(&[[1.0, 2.0, 3.0]], &[[0.0, 0.0, 1.0]], image);
-        assert_eq!(one.unpack(&of).prepared.points, [[1.0, 2.0, 3.0]]);
+        assert!(FineSurface::new(&[], &[], image.clone(), 0.1).is_none());
+        let one = FineSurface::new(&[[1.0, 2.0, 3.0]], &[[0.0, 0.0, 1.0]], image.clone(), 0.1);
+        assert_eq!(one.expect("one point").unpack(&of).prepared.points, [[1.0, 2.0, 3.0]]);
+        // A stray point 5 km off would leave steps of 8 cm.
+        let stray = [[0.0; 3], [5000.0, 0.0, 0.0]];
+        assert!(FineSurface::new(&stray, &[[0.0, 0.0, 1.0]; 2], image, 0.1).is_none());
     }
 }

@@ -22,7 +22,7 @@ use crate::geometry::{NearestGrid, NeighborIndex, Point, Pose, voxel_centroids};
 /// Fewest points with normals that can be registered.
 const MIN_POINTS: usize = 200;
 /// Most voxels a scan may fill: more means that the resolution does not fit the scan.
-const MAX_POINTS: usize = 400_000;
+pub(super) const MAX_POINTS: usize = 400_000;
 /// Radius of normals and of descriptors, in voxels.
 const NORMAL_RADIUS: f32 = 2.0;
 const DESCRIPTOR_RADIUS: f32 = 5.0;
@@ -108,7 +108,7 @@ pub struct PreparedScan {
     pub signature: Vec<f32>,
     /// What the sensor saw, when its position is known well enough.
     pub range_image: Option<RangeImage>,
-    /// Its surfaces at half the voxel, where the data are dense enough and there is a range image.
+    /// Its surfaces at half the voxel, where that gives 1.6 times the points and more, and there is a range image.
     pub fine: Option<FineSurface>,
     /// Where the sensor stood, as far as known; normals face it. Metres, local frame.
     pub viewpoint: Point,
@@ -256,11 +256,14 @@ pub fn prepare(
     if points.len() < MIN_POINTS {
         return Err(PrepareError::TooFewPoints { found: points.len(), needed: MIN_POINTS, resolution });
     }
+    control.check()?;
+    let is_finer = |count: usize| count as f64 > FINER * points.len() as f64;
     let fine_surface = view
         .range_image
         .as_ref()
+        .filter(|_| is_finer(fine.len()))
         .and_then(|_| fine_surface(cloud, &view.position, &fine, v))
-        .filter(|finer| finer.len() as f64 > FINER * points.len() as f64);
+        .filter(|finer| is_finer(finer.count()));
     control.check()?;
     let all = fpfh(&points, &normals, DESCRIPTOR_RADIUS * v);
     control.check()?;
@@ -299,5 +302,5 @@ fn fine_surface(cloud: &PointCloud, viewpoint: &Point, fine: &[Point], v: f32) -
         .filter_map(|(point, normal)| normal.map(|n| (*point, face(n, point, viewpoint))))
         .unzip();
     let (range_image, _) = RangeImage::render(&finer, *viewpoint, v / 2.0);
-    (!points.is_empty()).then(|| FineSurface::new(&points, &normals, range_image))
+    FineSurface::new(&points, &normals, range_image, v / 2.0)
 }

@@ -14,9 +14,10 @@ use super::gravity::Gravity;
 use super::options::{JoinLevel, MappingOptions};
 use super::surfaces::{align, judge, judge_inside};
 use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
 use crate::geometry::{Kernel, Pose, rigid_fit};
 use crate::graph::ScanGraph;
-use crate::pairwise::{Contrast, Counts, inlier_matches, look_finely};
+use crate::pairwise::{Counts, inlier_matches, is_clearly_worse, look_finely};
 
 const FIT_ITERATIONS: usize = 5;
 /// Firm support allows this many times the usual violation, at most.
@@ -137,17 +138,17 @@ impl<'m> ViolationLimit<'m> {
 }
 
 /// Weighs the candidates of two components against each other, best supported first (`candidates`, in that order): the first that keeps
-/// its support and stays clear of free space is taken, unless another that free space does not rule out is nearly as heavy. Returns
-/// `a_from_b`.
+/// its support and stays clear of free space is taken, unless another is nearly as heavy that neither free space rules out nor a second look
+/// finds clearly worse. Returns `a_from_b`.
 pub fn weigh_join(
     graph: &ScanGraph,
-    a: &Component,
-    b: &Component,
+    (a, b): (&Component, &Component),
     candidates: &[Candidate],
     level: &JoinLevel,
     voxel: f64,
     options: &MappingOptions,
-) -> Result<Pose, Refusal> {
+    control: Control<'_>,
+) -> Result<Result<Pose, Refusal>, Cancelled> {
     let mut first_refusal = None;
     let several = options.asks_for_several(a.len(), b.len(), level);
     let limit = ViolationLimit::new(graph, (a, b), level, options);
@@ -159,7 +160,7 @@ pub fn weigh_join(
     for (rank, candidate) in candidates.iter().enumerate() {
         if candidate.support < level.support {
             let refusal = Refusal::Support { found: candidate.support, needed: level.support };
-            return Err(first_refusal.unwrap_or(refusal));
+            return Ok(Err(first_refusal.unwrap_or(refusal)));
         }
         if several && !candidate.rests_on_several() {
             first_refusal = first_refusal.or(Some(Refusal::SinglePair { support: candidate.support }));
@@ -169,23 +170,24 @@ pub fn weigh_join(
             Ok(placed) => {
                 let margin = |rival: f64| placed.support - options.rival_share * rival;
                 // Rivals are looked at only as far as they matter.
-                let rival = candidates
+                let feared = candidates
                     .iter()
                     .enumerate()
-                    .filter(|(other, c)| *other != rank && margin(c.doubt) < level.support)
-                    .find(|(_, c)| {
-                        place(c, 0.0, 0)
-                            .is_ok_and(|rival| !outdone(graph, (a, b), (candidate, &placed), (c, &rival)))
-                    });
-                return match rival {
-                    Some((_, c)) => Err(Refusal::Rival { support: placed.support, rival: c.doubt }),
-                    None => Ok(placed.a_from_b),
-                };
+                    .filter(|(other, c)| *other != rank && margin(c.doubt) < level.support);
+                for (_, rival) in feared {
+                    control.check()?;
+                    if let Ok(there) = place(rival, 0.0, 0)
+                        && !outdone(graph, (a, b), (candidate, &placed), (rival, &there), voxel, control)?
+                    {
+                        return Ok(Err(Refusal::Rival { support: placed.support, rival: rival.doubt }));
+                    }
+                }
+                return Ok(Ok(placed.a_from_b));
             }
             Err(refusal) => first_refusal = first_refusal.or(Some(refusal)),
         }
     }
-    Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support }))
+    Ok(Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support })))
 }
 
 /// Whether a second look at the pairs that speak for either of two poses finds the rival's clearly worse.
@@ -194,7 +196,9 @@ fn outdone(
     (a, b): (&Component, &Component),
     (candidate, placed): (&Candidate, &Placed),
     (rival, rivals): (&Candidate, &Placed),
-) -> bool {
+    voxel: f64,
+    control: Control<'_>,
+) -> Result<bool, Cancelled> {
     let firmest = |c: &Candidate| {
         let mut members: Vec<(f64, ScanKey, ScanKey)> =
             c.members.iter().map(|m| (m.doubt, m.in_a, m.in_b)).collect();
@@ -204,6 +208,7 @@ fn outdone(
     let pairs: BTreeSet<(ScanKey, ScanKey)> = firmest(candidate).chain(firmest(rival)).collect();
     let (mut mine, mut others) = (Counts::default(), Counts::default());
     for (in_a, in_b) in pairs {
+        control.check()?;
         let (Some(x), Some(y)) = (graph.scan(in_a), graph.scan(in_b)) else { continue };
         let (Some(a_from_x), Some(b_from_y)) = (a.poses.get(&in_a), b.poses.get(&in_b)) else { continue };
         let between = |a_from_b: &Pose| a_from_x.inverse() * *a_from_b * *b_from_y;
@@ -214,7 +219,7 @@ fn outdone(
             others = others.plus(&at_others);
         }
     }
-    mine.points > 0 && Contrast::between(&mine, &others).is_decisive()
+    Ok(is_clearly_worse(&mine, &others, voxel / 2.0))
 }
 
 /// The share of judged points that speak against a pose: in free space, or all of them where surfaces cross instead of coinciding,

@@ -98,7 +98,7 @@ impl Mapper {
             if self.refused.still_holds(link, next.support, level) {
                 continue;
             }
-            match weigh_join(graph, component, &single, &next.candidates, level, voxel, options) {
+            match weigh_join(graph, (component, &single), &next.candidates, level, voxel, options, control)? {
                 Ok(a_from_b) => {
                     self.waiting.remove(&next.scan);
                     let component = &mut self.components[next.component];
@@ -179,7 +179,7 @@ impl Mapper {
             if self.refused.still_holds(link, support, level) {
                 continue;
             }
-            match weigh_join(graph, &a, &b, &candidates, level, voxel, options) {
+            match weigh_join(graph, (&a, &b), &candidates, level, voxel, options, control)? {
                 Ok(a_from_b) => {
                     a.absorb(b, &a_from_b, graph, options);
                     self.waiting.remove(&first);
@@ -243,7 +243,7 @@ impl Mapper {
                 continue;
             }
             let (first, second) = (&self.components[a], &self.components[b]);
-            match weigh_join(graph, first, second, &candidates, level, voxel, options) {
+            match weigh_join(graph, (first, second), &candidates, level, voxel, options, control)? {
                 Ok(a_from_b) => {
                     let other = self.components[b].clone();
                     self.components[a].absorb(other, &a_from_b, graph, options);

@@ -9,7 +9,7 @@ use crate::cloud::ScanKey;
 /// Support that changes by a smaller share is what it was.
 const SAME_SUPPORT: f64 = 0.05;
 
-/// Two pieces, each known by its gauge or by the scan that it is: in either order.
+/// Two pieces, each known by its gauge or by the scan that it is, in either order; a piece that has grown keeps its gauge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Link(ScanKey, ScanKey);
 

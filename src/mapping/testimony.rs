@@ -8,7 +8,7 @@ use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
 use crate::graph::{ScanGraph, softplus};
-use crate::pairwise::{Contrast, PairKey, centred_difference, look_finely};
+use crate::pairwise::{PairKey, centred_difference, is_clearly_worse, look_finely};
 
 /// A pair says that much by itself (softplus of its log-odds) when it counts as a witness: a likelihood of 0.86.
 const WITNESS: f64 = 2.0;
@@ -50,8 +50,8 @@ pub struct Testimony {
 }
 
 impl Testimony {
-    /// Asks the pairs that contradict again, with a second look, if as many say the same as could lead to anything. A pair whose scans
-    /// fit clearly better where they are than where it would have them is no witness.
+    /// Asks the pairs that contradict again, with a second look, if several speak with the voice that weighs most. A pair whose scans fit
+    /// clearly better where they are than where it would have them is no witness.
     pub fn cross_examine(
         &mut self,
         graph: &ScanGraph,
@@ -147,7 +147,7 @@ fn is_refuted(graph: &ScanGraph, component: &Component, contradiction: &Contradi
     let now = component.poses.get(&a)?.inverse() * *component.poses.get(&b)?;
     let (a, b) = (graph.scan(a)?, graph.scan(b)?);
     let (here, there) = (look_finely(a, b, &now)?, look_finely(a, b, &contradiction.a_from_b)?);
-    Some(Contrast::between(&here, &there).is_decisive())
+    Some(is_clearly_worse(&here, &there, a.prepared.resolution / 2.0))
 }
 
 #[cfg(test)]

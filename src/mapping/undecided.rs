@@ -63,21 +63,22 @@ pub fn undecided(
     cuts.sort_by(|x, y| x.0.total_cmp(&y.0).then_with(|| x.1.cmp(&y.1)));
     for (_, side, strongest) in cuts {
         control.check()?;
-        if let Some(rivals) = reweigh(graph, component, &side, voxel, options) {
+        if let Some(rivals) = reweigh(graph, component, &side, voxel, options, control).transpose()? {
             return Ok(Some(Undecided { side: smaller_side(component, side), strongest, rivals }));
         }
     }
     Ok(None)
 }
 
-/// Joins the two sides anew: `Some(true)` if rivals forbid it, `Some(false)` if another pose is better, `None` if it is what it was.
+/// Joins the two sides anew: true if rivals forbid it, false if another pose is better, `None` if it is what it was.
 fn reweigh(
     graph: &ScanGraph,
     component: &Component,
     side: &BTreeSet<ScanKey>,
     voxel: f64,
     options: &MappingOptions,
-) -> Option<bool> {
+    control: Control<'_>,
+) -> Option<Result<bool, Cancelled>> {
     // What is joined already need show no least support; a rival may have its share of it, however firm it is.
     let level = JoinLevel { support: 0.0, ..*options.levels.last()? };
     // A pose nearby is no other place; and one pair may speak for what is joined already.
@@ -100,10 +101,11 @@ fn reweigh(
     if best.margin(&options) >= level.support && !moved(graph, &part, &now, &best.a_from_b, voxel, &options) {
         return None;
     }
-    match weigh_join(graph, &rest, &part, &found, &level, voxel, &options) {
-        Ok(a_from_b) => moved(graph, &part, &now, &a_from_b, voxel, &options).then_some(false),
-        Err(Refusal::Rival { .. }) => Some(true),
-        Err(_) => None,
+    match weigh_join(graph, (&rest, &part), &found, &level, voxel, &options, control) {
+        Ok(Ok(a_from_b)) => moved(graph, &part, &now, &a_from_b, voxel, &options).then_some(Ok(false)),
+        Ok(Err(Refusal::Rival { .. })) => Some(Ok(true)),
+        Ok(Err(_)) => None,
+        Err(cancelled) => Some(Err(cancelled)),
     }
 }
 

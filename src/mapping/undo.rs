@@ -85,6 +85,7 @@ impl Mapper {
                 }
             }
         }
+        graph.forget_fine();
         self.dissolve_small();
         self.sort_components();
         Ok(bans)

@@ -25,7 +25,7 @@ pub use matching::{Match, mutual_matches};
 pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};
 pub use planar::planar_poses;
 pub use probe::{Probe, probe};
-pub use second_look::{Contrast, look_finely};
+pub use second_look::{Contrast, is_clearly_worse, look_finely};
 pub use shortlist::shortlist;
 pub use verifier::{
     Evidence, FEATURES, FittedScene, Logistic, Provenance, TRIPLET_FEATURES, Verifier, VerifierError,

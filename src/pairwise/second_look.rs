@@ -8,6 +8,12 @@ use crate::geometry::Pose;
 
 /// Counts that stand for chance: some violations, and some judged points.
 const CHANCE: (f64, f64) = (3.0, 300.0);
+/// Surfaces that lie this near, in voxels of the second look, lie on each other: packing and sampling do as much.
+const NO_DISTANCE: f64 = 0.05;
+/// Where fewer points lie on the other's surface, nothing can be said of how well they fit.
+const LEAST_CONTACTS: u32 = 100;
+/// Where a smaller share of them does, the scans are apart, and their fit speaks for nothing.
+const LEAST_OVERLAP: f64 = 0.1;
 /// What a contrast is worth as log-odds: violations, distances. Fitted to right and wrong poses of the same pairs in halls, houses,
 /// offices and indoor depth-camera scenes.
 const WORTH: (f64, f64) = (1.5, 2.8);
@@ -25,13 +31,18 @@ pub struct Contrast {
 }
 
 impl Contrast {
-    /// How much worse the second counts are.
+    /// How much worse the second counts are, both taken with voxels of this size (metres). `None` where too little meets to tell, or so little
+    /// at the first pose that it is no overlap.
     #[must_use]
-    pub fn between(pose: &Counts, other: &Counts) -> Self {
-        Self {
-            violation: log_violation(other) - log_violation(pose),
-            apart: log_distance(other) - log_distance(pose),
+    pub fn between(pose: &Counts, other: &Counts, voxel: f64) -> Option<Self> {
+        let few = pose.inliers.min(other.inliers) < LEAST_CONTACTS;
+        if few || pose.overlap() < LEAST_OVERLAP {
+            return None;
         }
+        Some(Self {
+            violation: log_violation(other) - log_violation(pose),
+            apart: log_distance(other, voxel) - log_distance(pose, voxel),
+        })
     }
 
     /// Whether the other pose is clearly worse.
@@ -42,7 +53,7 @@ impl Contrast {
 }
 
 /// What two scans say of a pose (b to a, local frames) at half the voxel, both directions together, once it is aligned as finely. `None`
-/// where either scan is no finer than its voxels, or has no range image.
+/// where either scan has no finer surfaces ([`Scan::fine`]).
 #[must_use]
 pub fn look_finely(a: &Scan, b: &Scan, a_from_b: &Pose) -> Option<Counts> {
     let (a, b) = (a.fine()?, b.fine()?);
@@ -55,9 +66,15 @@ fn log_violation(counts: &Counts) -> f64 {
     ((f64::from(counts.violations) + CHANCE.0) / (judged + CHANCE.1)).ln()
 }
 
-fn log_distance(counts: &Counts) -> f64 {
+fn log_distance(counts: &Counts, voxel: f64) -> f64 {
     let square = f64::from(counts.plane_square) / f64::from(counts.inliers.max(1));
-    square.max(f64::MIN_POSITIVE).sqrt().ln()
+    (square + (NO_DISTANCE * voxel).powi(2)).sqrt().ln()
+}
+
+/// Whether the second counts are clearly worse, both taken with voxels of this size (metres).
+#[must_use]
+pub fn is_clearly_worse(pose: &Counts, other: &Counts, voxel: f64) -> bool {
+    Contrast::between(pose, other, voxel).is_some_and(|contrast| contrast.is_decisive())
 }
 
 #[cfg(test)]
@@ -69,6 +86,36 @@ mod tests {
     use crate::control::{CancelToken, Control, Seed, Silent};
     use crate::features::{PrepareOptions, SensorPosition, choose_resolution, natural_resolution, prepare};
     use crate::simulate::{BuildingOptions, Layout, Sensor, SurveyOptions, simulate};
+
+    #[test]
+    fn a_pose_at_which_little_meets_is_never_the_better_one() {
+        let counts = |inliers: u32, violations: u32, apart: f32| Counts {
+            points: 30_000,
+            inliers,
+            violations,
+            plane_square: inliers as f32 * apart * apart,
+            ..Counts::default()
+        };
+        let (good, bad) = (counts(20_000, 30, 0.02), counts(19_000, 200, 0.03));
+        assert!(is_clearly_worse(&good, &bad, 0.1) && !is_clearly_worse(&bad, &good, 0.1));
+        for few in [counts(0, 0, 0.0), counts(40, 0, 0.01), counts(2_500, 0, 0.01)] {
+            assert!(!is_clearly_worse(&few, &bad, 0.1), "{few:?}");
+        }
+        assert_eq!(Contrast::between(&good, &counts(0, 0, 0.0), 0.1), None);
+        assert_eq!(Contrast::between(&Counts::default(), &Counts::default(), 0.1), None);
+    }
+
+    #[test]
+    fn noise_far_below_the_voxel_decides_nothing() {
+        let exact = |apart: f32| Counts {
+            points: 1000,
+            inliers: 1000,
+            plane_square: 1000.0 * apart * apart,
+            ..Counts::default()
+        };
+        assert!(!is_clearly_worse(&exact(0.0), &exact(1e-4), 0.1));
+        assert!(!is_clearly_worse(&exact(1e-7), &exact(1e-4), 0.1));
+    }
 
     #[test]
     fn a_hall_that_is_turned_by_half_is_told_from_the_right_one() {
@@ -118,8 +165,9 @@ mod tests {
                 let wrong = model_from_a.inverse() * turned * *model_from_b;
                 let seen = |pose| look_finely(a, b, pose).expect("the scans are fine enough");
                 let (right, turned) = (seen(&truth), seen(&wrong));
-                assert!(!Contrast::between(&turned, &right).is_decisive(), "{right:?} {turned:?}");
-                decided += usize::from(Contrast::between(&right, &turned).is_decisive());
+                let voxel = options.resolution / 2.0;
+                assert!(!is_clearly_worse(&turned, &right, voxel), "{right:?} {turned:?}");
+                decided += usize::from(is_clearly_worse(&right, &turned, voxel));
             }
         }
         assert!(decided >= 4, "{decided} of 6 pairs tell the ends of the hall apart");
