@@ -18,7 +18,7 @@ const LEAST_OVERLAP: f64 = 0.1;
 /// offices and indoor depth-camera scenes.
 const WORTH: (f64, f64) = (1.5, 2.8);
 /// Log-odds from which it decides. It then finds two thirds and more of the wrong poses that look right in halls, and hardly ever takes the right
-/// one for wrong.
+/// one for wrong, except in rows of identical rooms, where one pair in four says either.
 const DECISIVE: f64 = 1.0;
 
 /// How much worse one pose is than another at half the voxel: logarithms of ratios, 0 where both are alike.
