@@ -10,7 +10,7 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 use super::block_solver::{BlockSolver, BlockSolverError};
 use super::block_system::BlockSystem;
 use super::gauge::Gauge;
-use super::levenberg_marquardt::OptionError;
+use super::option_error::OptionError;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Kernel;
 

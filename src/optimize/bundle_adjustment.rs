@@ -4,8 +4,8 @@ use nalgebra::{Vector3, Vector6};
 
 use super::gauge::Gauge;
 use super::landmark_terms::{LandmarkTerms, Track, TrackError};
-use super::levenberg_marquardt::{MinimiseError, MinimiseOptions, OptionError, Problem, Report, minimise};
-use super::{BlockSolver, BlockSolverError, BlockSystem};
+use super::levenberg_marquardt::{MinimiseError, MinimiseOptions, Problem, Report, minimise};
+use super::{BlockSolver, BlockSolverError, BlockSystem, OptionError};
 use crate::control::Control;
 use crate::geometry::{Kernel, Pose};
 

@@ -12,8 +12,8 @@ use super::bundle_adjustment::{BundleState, moved};
 use super::dense_pair::{Correspondence, Hold, PairTerms, blind_motions, pair_cost};
 use super::gauge::Gauge;
 use super::landmark_terms::{LandmarkTerms, Track, TrackError};
-use super::levenberg_marquardt::{MinimiseError, MinimiseOptions, OptionError, Problem, Report, minimise};
-use super::{BlockSolver, BlockSolverError, BlockSystem};
+use super::levenberg_marquardt::{MinimiseError, MinimiseOptions, Problem, Report, minimise};
+use super::{BlockSolver, BlockSolverError, BlockSystem, OptionError};
 use crate::control::{Control, Stage};
 use crate::geometry::{Kernel, Pose};
 

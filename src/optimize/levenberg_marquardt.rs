@@ -3,10 +3,14 @@
 //! Steps are judged by the true energy, robust kernels included, never by the linearised one; damping follows
 //! Nielsen (1999): it shrinks by the gain ratio and grows twice as fast with every rejection in a row.
 
+mod outcome;
+
 use nalgebra::Vector6;
 
-use super::{BlockSolver, BlockSolverError, BlockSystem};
-use crate::control::{Cancelled, Control};
+pub use outcome::{MinimiseError, Minimum, Report, Termination};
+
+use super::{BlockSolver, BlockSolverError, BlockSystem, OptionError};
+use crate::control::Control;
 
 /// An energy over poses and whatever is eliminated beside them.
 pub trait Problem {
@@ -47,32 +51,6 @@ impl Default for MinimiseOptions {
     }
 }
 
-/// An option that makes no sense.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-#[error("option {name} is {value}, but it must be {requirement}")]
-pub struct OptionError {
-    /// The field.
-    pub name: &'static str,
-    /// What it was.
-    pub value: f64,
-    /// What it may be.
-    pub requirement: &'static str,
-}
-
-impl OptionError {
-    /// Checks that a number is positive and finite.
-    pub(super) fn positive(name: &'static str, value: f64) -> Result<(), Self> {
-        let requirement = "positive and finite";
-        if value > 0.0 && value.is_finite() { Ok(()) } else { Err(Self { name, value, requirement }) }
-    }
-
-    /// Checks that a number is at least zero and finite.
-    pub(super) fn not_negative(name: &'static str, value: f64) -> Result<(), Self> {
-        let requirement = "at least zero and finite";
-        if value >= 0.0 && value.is_finite() { Ok(()) } else { Err(Self { name, value, requirement }) }
-    }
-}
-
 impl MinimiseOptions {
     /// Checks that every tolerance is a number of at least zero and the damping is positive.
     pub fn validate(&self) -> Result<(), OptionError> {
@@ -81,114 +59,6 @@ impl MinimiseOptions {
         OptionError::not_negative("gradient", self.gradient)?;
         OptionError::positive("initial_damping", self.initial_damping)
     }
-}
-
-/// Why the minimiser stopped, with what was measured and the limit it met.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Termination {
-    /// The gradient promises too little.
-    Gradient {
-        /// Share of the energy.
-        measured: f64,
-        /// The limit.
-        threshold: f64,
-    },
-    /// The step was too small.
-    Step {
-        /// Largest turn in radians or shift in lengths.
-        measured: f64,
-        /// The limit.
-        threshold: f64,
-    },
-    /// The energy no longer falls.
-    RelativeCost {
-        /// Share of the energy.
-        measured: f64,
-        /// The limit.
-        threshold: f64,
-    },
-    /// The iterations are used up; the state is the best so far.
-    MaxIterations {
-        /// How many.
-        iterations: usize,
-    },
-    /// No step lowers the energy, however short; the state is the best so far.
-    NoProgress {
-        /// Damping reached.
-        measured: f64,
-        /// The limit.
-        threshold: f64,
-    },
-    /// Every pose is held, or there is nothing that could move one.
-    NothingFree,
-}
-
-impl std::fmt::Display for Termination {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Gradient { measured, threshold } => {
-                write!(f, "the gradient promises {measured:.1e} of the energy (limit {threshold:.1e})")
-            }
-            Self::Step { measured, threshold } => {
-                write!(f, "the last step was {measured:.1e} (limit {threshold:.1e})")
-            }
-            Self::RelativeCost { measured, threshold } => {
-                write!(f, "the energy fell by a share of {measured:.1e} (limit {threshold:.1e})")
-            }
-            Self::MaxIterations { iterations } => write!(f, "all {iterations} iterations are used up"),
-            Self::NoProgress { measured, threshold } => {
-                write!(f, "no step lowers the energy: damping reached {measured:.1e} (limit {threshold:.1e})")
-            }
-            Self::NothingFree => write!(f, "nothing is free to move"),
-        }
-    }
-}
-
-/// What a minimisation did.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Report {
-    /// Linear solves, rejected steps included.
-    pub iterations: usize,
-    /// The true energy at the start, metres squared.
-    pub cost_before: f64,
-    /// The true energy at the end, never above that at the start.
-    pub cost_after: f64,
-    /// Why it stopped.
-    pub termination: Termination,
-}
-
-impl Report {
-    /// Whether a minimum was found, as far as the tolerances tell.
-    #[must_use]
-    pub fn converged(&self) -> bool {
-        !matches!(self.termination, Termination::MaxIterations { .. } | Termination::NoProgress { .. })
-    }
-}
-
-/// The state with the least energy found.
-#[derive(Debug, Clone)]
-pub struct Minimum<S> {
-    /// Poses, and what follows from them.
-    pub state: S,
-    /// How it was found.
-    pub report: Report,
-}
-
-/// Why nothing could be minimised.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum MinimiseError {
-    /// An option makes no sense.
-    #[error(transparent)]
-    Option(#[from] OptionError),
-    /// The energy of the start is infinite or not a number.
-    #[error("the energy at the start is {0}")]
-    NotFinite(f64),
-    /// The problem does not fit this machine.
-    #[error(transparent)]
-    Solver(BlockSolverError),
-    /// Stopped by the caller.
-    #[error(transparent)]
-    Cancelled(#[from] Cancelled),
 }
 
 /// Damping beyond which a step is shorter than rounding.
@@ -317,114 +187,6 @@ impl Damping {
 }
 
 #[cfg(test)]
-pub(super) mod laws {
-    use super::*;
-
-    /// Panics unless the right-hand side is minus half the numerical gradient of the true cost, for all free numbers.
-    pub(in crate::optimize) fn assert_gradient<P: Problem>(
-        problem: &P,
-        state: &P::State,
-        variables: usize,
-        tolerance: f64,
-    ) {
-        let (system, cost) = problem.linearise(state);
-        assert!((cost - problem.cost(state)).abs() <= 1e-12 * cost, "linearise and cost disagree");
-        let h = 1e-6;
-        for variable in (0..variables).filter(|&v| system.slot(v).is_some()) {
-            for axis in 0..6 {
-                let moved = |h: f64| {
-                    let mut delta = vec![Vector6::zeros(); variables];
-                    delta[variable][axis] = h;
-                    problem.cost(&problem.step(state, &delta))
-                };
-                let numeric = -(moved(h) - moved(-h)) / (4.0 * h);
-                let analytic = system.rhs()[system.slot(variable).unwrap()][axis];
-                let scale = tolerance * system.diagonal_block(variable).unwrap()[(axis, axis)].max(1.0);
-                assert!(
-                    (numeric - analytic).abs() < scale,
-                    "variable {variable}, axis {axis}: numerical {numeric:.9e}, analytic {analytic:.9e}"
-                );
-            }
-        }
-    }
-}
-
+pub(super) mod laws;
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::control::{CancelToken, Silent};
-    use nalgebra::Matrix6;
-
-    /// One variable whose state is a plain vector; `sum_k (x_k^2 - k)^2 / 4 + offset`: curved, with a known minimum.
-    struct Quartic {
-        offset: f64,
-    }
-
-    impl Problem for Quartic {
-        type State = Vector6<f64>;
-
-        fn cost(&self, x: &Vector6<f64>) -> f64 {
-            (0..6).map(|k| (x[k] * x[k] - k as f64).powi(2) / 4.0).sum::<f64>() + self.offset
-        }
-
-        fn linearise(&self, x: &Vector6<f64>) -> (BlockSystem, f64) {
-            let mut system = BlockSystem::new(&[false]);
-            let residual = Vector6::from_fn(|k, _| 0.5 * (x[k] * x[k] - k as f64));
-            system.add(0, 0, &Matrix6::from_diagonal(&x.component_mul(x)));
-            system.add_rhs(0, &-x.component_mul(&residual));
-            (system, self.cost(x))
-        }
-
-        fn step(&self, x: &Vector6<f64>, delta: &[Vector6<f64>]) -> Vector6<f64> {
-            x + delta[0]
-        }
-
-        fn length(&self) -> f64 {
-            1.0
-        }
-    }
-
-    fn run(offset: f64, options: &MinimiseOptions) -> Minimum<Vector6<f64>> {
-        let cancel = CancelToken::new();
-        let control = Control { cancel: &cancel, observer: &Silent };
-        minimise(&Quartic { offset }, Vector6::repeat(3.0), options, control).unwrap()
-    }
-
-    #[test]
-    fn a_curved_valley_is_descended_to_its_bottom() {
-        let minimum = run(1.0, &MinimiseOptions { relative_cost: 1e-14, ..MinimiseOptions::default() });
-        assert!(minimum.report.converged(), "{:?}", minimum.report);
-        assert!((minimum.report.cost_after - 1.0).abs() < 1e-8, "{:?}", minimum.report);
-    }
-
-    #[test]
-    fn the_reason_to_stop_carries_the_measure_and_the_limit() {
-        let few = MinimiseOptions { max_iterations: 2, ..MinimiseOptions::default() };
-        assert_eq!(run(1.0, &few).report.termination, Termination::MaxIterations { iterations: 2 });
-        let coarse = MinimiseOptions { relative_cost: 0.9, ..MinimiseOptions::default() };
-        let Termination::RelativeCost { measured, threshold } = run(1e6, &coarse).report.termination else {
-            panic!("another reason")
-        };
-        assert!(measured <= threshold && threshold == 0.9);
-    }
-
-    #[test]
-    fn a_cancelled_run_is_an_error_and_so_is_an_energy_that_is_no_number() {
-        let cancel = CancelToken::new();
-        let control = Control { cancel: &cancel, observer: &Silent };
-        let options = MinimiseOptions::default();
-        let nan = minimise(&Quartic { offset: f64::NAN }, Vector6::repeat(3.0), &options, control);
-        assert!(matches!(nan, Err(MinimiseError::NotFinite(_))));
-        cancel.cancel();
-        let stopped = minimise(&Quartic { offset: 0.0 }, Vector6::repeat(3.0), &options, control);
-        assert!(matches!(stopped, Err(MinimiseError::Cancelled(_))));
-    }
-
-    #[test]
-    fn options_that_make_no_sense_are_named() {
-        let options = MinimiseOptions { step: f64::NAN, ..MinimiseOptions::default() };
-        assert_eq!(options.validate().unwrap_err().name, "step");
-        let options = MinimiseOptions { initial_damping: 0.0, ..MinimiseOptions::default() };
-        assert_eq!(options.validate().unwrap_err().name, "initial_damping");
-    }
-}
+mod tests;

@@ -24,6 +24,7 @@ mod gauge;
 mod joint_dense;
 mod landmark_terms;
 mod levenberg_marquardt;
+mod option_error;
 mod pose_graph;
 mod rotation_averaging;
 #[cfg(test)]
@@ -42,8 +43,9 @@ pub use joint_dense::{
 };
 pub use landmark_terms::{Observation, Track, TrackError};
 pub use levenberg_marquardt::{
-    MinimiseError, MinimiseOptions, Minimum, OptionError, Problem, Report, Termination, minimise,
+    MinimiseError, MinimiseOptions, Minimum, Problem, Report, Termination, minimise,
 };
+pub use option_error::OptionError;
 pub use pose_graph::{
     EdgeMetric, PoseEdge, PoseGraphAdjustment, PoseGraphError, PoseGraphOptions, adjust_pose_graph,
 };

@@ -7,11 +7,11 @@
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 
-use super::BlockSystem;
 use super::bundle_adjustment::moved;
 use super::gauge::Gauge;
-use super::levenberg_marquardt::{MinimiseError, MinimiseOptions, OptionError, Problem, Report, minimise};
+use super::levenberg_marquardt::{MinimiseError, MinimiseOptions, Problem, Report, minimise};
 use super::twist::{adjoint, inverse_left_jacobian, quarters, rotation_vector, skew, twist};
+use super::{BlockSystem, OptionError};
 use crate::control::Control;
 use crate::geometry::{Kernel, Pose};
 
