@@ -5,117 +5,23 @@
 //! added with a small weight, and what a pair's planes leave free is held at the round's start, so that scans which share
 //! a single plane do not slide along it.
 
+mod options;
+mod problem;
+
 use nalgebra::{Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
+
+pub use options::DenseOptions;
+pub use problem::{Correspondences, DenseError, DenseProblem};
 
 use super::bundle_adjustment::{BundleState, moved};
 use super::dense_pair::{Correspondence, Hold, PairTerms, blind_motions, pair_cost};
 use super::gauge::Gauge;
-use super::landmark_terms::{LandmarkTerms, Track, TrackError};
-use super::levenberg_marquardt::{MinimiseError, MinimiseOptions, Problem, Report, minimise};
-use super::{BlockSolver, BlockSolverError, BlockSystem, OptionError};
+use super::landmark_terms::LandmarkTerms;
+use super::levenberg_marquardt::{MinimiseError, Problem, Report, minimise};
+use super::{BlockSolver, BlockSolverError, BlockSystem};
 use crate::control::{Control, Stage};
 use crate::geometry::{Kernel, Pose};
-
-/// Finds which points of one scan lie on which surface of another. Called from several threads.
-pub trait Correspondences: Sync {
-    /// Ordered pairs (i, j) of scans: points of j are sought on surfaces of i. List both orders to use both directions.
-    fn pairs(&self) -> &[(usize, usize)];
-
-    /// Correspondences of the pair at this index, at a relative pose, no further apart than `gate` metres. Must depend on
-    /// nothing else.
-    fn associate(&self, pair: usize, i_from_j: &Pose, gate: f64) -> Vec<Correspondence>;
-}
-
-/// Gates, kernels and weights.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct DenseOptions {
-    /// The gate of the first round, metres: about four voxels.
-    pub first_gate: f64,
-    /// The gate of the last round, metres: about three standard deviations of the points.
-    pub final_gate: f64,
-    /// Rounds of association; the gates between the first and the last are in geometric progression.
-    pub rounds: usize,
-    /// Of point-to-plane distances, its scale (metres) that of the last round; earlier ones are wider as their gates are.
-    pub kernel: Kernel,
-    /// Multiplies the weights of landmark observations: the variance of plane distances over that of keypoints.
-    pub landmark_weight: f64,
-    /// Of the distance between an observation and its landmark, scale in metres.
-    pub landmark_kernel: Kernel,
-    /// The share of a motion's displacement along normals below which a pair is blind to it.
-    pub blind_share: f64,
-    /// The weight of the hold on blind motions, as a share of point-to-point information; zero for no hold.
-    pub hold_weight: f64,
-    /// Pairs with fewer correspondences are left out of a round.
-    pub least_correspondences: usize,
-    /// When a round's minimisation stops.
-    pub minimise: MinimiseOptions,
-}
-
-impl DenseOptions {
-    /// The defaults for a first and a last gate in metres.
-    #[must_use]
-    pub fn with_gates(first_gate: f64, final_gate: f64) -> Self {
-        Self {
-            first_gate,
-            final_gate,
-            rounds: 6,
-            kernel: Kernel::GemanMcClure(0.5 * final_gate),
-            landmark_weight: 0.01,
-            landmark_kernel: Kernel::Cauchy(first_gate),
-            blind_share: 0.01,
-            hold_weight: 0.1,
-            least_correspondences: 30,
-            minimise: MinimiseOptions {
-                max_iterations: 5,
-                relative_cost: 1e-4,
-                ..MinimiseOptions::default()
-            },
-        }
-    }
-
-    /// Checks gates, scales, weights and tolerances.
-    pub fn validate(&self) -> Result<(), OptionError> {
-        OptionError::positive("final_gate", self.final_gate)?;
-        OptionError::positive("rounds", self.rounds as f64)?;
-        OptionError::positive("kernel", self.kernel.scale().unwrap_or(1.0))?;
-        OptionError::positive("landmark_kernel", self.landmark_kernel.scale().unwrap_or(1.0))?;
-        OptionError::not_negative("landmark_weight", self.landmark_weight)?;
-        OptionError::not_negative("blind_share", self.blind_share)?;
-        OptionError::not_negative("hold_weight", self.hold_weight)?;
-        if self.first_gate.is_nan() || self.first_gate < self.final_gate || self.first_gate.is_infinite() {
-            let requirement = "finite and at least final_gate";
-            return Err(OptionError { name: "first_gate", value: self.first_gate, requirement });
-        }
-        self.minimise.validate()
-    }
-
-    /// The gate of a round, metres.
-    fn gate(&self, round: usize) -> f64 {
-        if round + 1 >= self.rounds {
-            return self.final_gate;
-        }
-        let done = round as f64 / (self.rounds - 1) as f64;
-        self.first_gate * (self.final_gate / self.first_gate).powf(done)
-    }
-
-    fn kernel_at(&self, gate: f64) -> Kernel {
-        self.kernel.scale().map_or(self.kernel, |c| self.kernel.with_scale(c * gate / self.final_gate))
-    }
-}
-
-/// What is adjusted, and by what.
-#[derive(Clone, Copy)]
-pub struct DenseProblem<'a, C> {
-    /// `model_from_scan`, one a scan.
-    pub poses: &'a [Pose],
-    /// Scans that must not move, one flag a scan.
-    pub held: &'a [bool],
-    /// Surfaces.
-    pub surfaces: &'a C,
-    /// Landmarks; may be empty.
-    pub tracks: &'a [Track],
-}
 
 /// One round of association and minimisation.
 #[derive(Debug, Clone, PartialEq)]
@@ -160,51 +66,6 @@ impl DenseAdjustment {
     }
 }
 
-/// Why nothing was adjusted.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum DenseError {
-    /// One flag a pose is needed.
-    #[error("{flags} held flags were given for {poses} poses")]
-    HeldMismatch {
-        /// Flags.
-        flags: usize,
-        /// Poses.
-        poses: usize,
-    },
-    /// A pose has an entry that is not finite.
-    #[error("the pose of scan {scan} is not finite")]
-    PoseNotFinite {
-        /// Its index.
-        scan: usize,
-    },
-    /// A pair joins a scan to itself or to one that is not among the poses.
-    #[error("pair {pair} joins scans {i} and {j} of {scans}")]
-    BadPair {
-        /// Its index.
-        pair: usize,
-        /// One scan.
-        i: usize,
-        /// The other.
-        j: usize,
-        /// How many there are.
-        scans: usize,
-    },
-    /// No pair has enough correspondences in the gate, and there are no tracks.
-    #[error("no two scans have {least} correspondences within {gate} m, and there are no tracks")]
-    NothingInCommon {
-        /// The least number.
-        least: usize,
-        /// Metres.
-        gate: f64,
-    },
-    /// A track is malformed.
-    #[error(transparent)]
-    Track(#[from] TrackError),
-    /// The minimiser failed, or was cancelled.
-    #[error(transparent)]
-    Minimise(#[from] MinimiseError),
-}
-
 /// Minimises `sum_pairs sum_k w_k rho(r_k^2) + landmark_weight * landmark energy + hold` over the poses that are not held,
 /// r the distance of a point of scan j from the plane it is associated with in scan i.
 ///
@@ -247,24 +108,6 @@ pub fn adjust_dense<C: Correspondences>(
                 system,
             });
         }
-    }
-}
-
-impl<C: Correspondences> DenseProblem<'_, C> {
-    fn validate(&self) -> Result<(), DenseError> {
-        let scans = self.poses.len();
-        if self.held.len() != scans {
-            return Err(DenseError::HeldMismatch { flags: self.held.len(), poses: scans });
-        }
-        if let Some(scan) = self.poses.iter().position(|pose| !pose.is_finite()) {
-            return Err(DenseError::PoseNotFinite { scan });
-        }
-        for (pair, &(i, j)) in self.surfaces.pairs().iter().enumerate() {
-            if i == j || i >= scans || j >= scans {
-                return Err(DenseError::BadPair { pair, i, j, scans });
-            }
-        }
-        Ok(())
     }
 }
 

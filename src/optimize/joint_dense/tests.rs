@@ -1,6 +1,7 @@
 use nalgebra::Rotation3;
 use rand::RngExt;
 
+use super::super::Track;
 use super::super::levenberg_marquardt::laws::assert_gradient;
 use super::super::test_scene::{
     assert_poses_near, disturbed, poses, rng, tracks, vector, with_control, with_threads,
