@@ -5,9 +5,11 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::draw::Draw;
-use super::furnish::{Footprint, furnish};
+use super::footprint::Footprint;
+use super::furnish::furnish;
 use super::hazards::{Hazards, darken, glaze, hazardous};
-use super::plan::{Doorway, Layout, Room, draw_plan};
+use super::openings::Doorway;
+use super::plan::{Layout, Room, draw_plan};
 use super::scene::Scene;
 use super::solid::{Ray, Solid};
 use super::walls::shell;

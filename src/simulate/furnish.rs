@@ -4,158 +4,16 @@
 use std::f32::consts::{FRAC_PI_2, PI};
 
 use super::draw::Draw;
+use super::footprint::Footprint;
 use super::furniture::{self as f, Piece};
-use super::plan::{OpeningKind, Plan, Room, RoomKind};
+use super::openings::OpeningKind;
+use super::plan::{Plan, Room, RoomKind};
 use super::solid::Solid;
+use super::suites::{Maker, Suite, suite};
 use crate::control::Seed;
-
-/// An oriented rectangle on the floor, taken by something `top` metres high.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Footprint {
-    pub centre: [f32; 2],
-    pub half: [f32; 2],
-    /// Turn about the vertical, radians.
-    pub angle: f32,
-    pub top: f32,
-}
-
-impl Footprint {
-    /// Whether a circle touches the rectangle.
-    pub(super) fn reaches(&self, [x, y]: [f32; 2], radius: f32) -> bool {
-        let (sin, cos) = self.angle.sin_cos();
-        let (dx, dy) = (x - self.centre[0], y - self.centre[1]);
-        let outside = |own: f32, half: f32| (own.abs() - half).max(0.0);
-        let (u, v) = (outside(cos * dx + sin * dy, self.half[0]), outside(cos * dy - sin * dx, self.half[1]));
-        u.hypot(v) < radius.max(1e-6)
-    }
-
-    fn axes(&self) -> [[f32; 2]; 2] {
-        let (sin, cos) = self.angle.sin_cos();
-        [[cos, sin], [-sin, cos]]
-    }
-
-    /// Half the extent along a unit vector.
-    fn reach_along(&self, [x, y]: [f32; 2]) -> f32 {
-        let [u, v] = self.axes();
-        self.half[0] * (u[0] * x + u[1] * y).abs() + self.half[1] * (v[0] * x + v[1] * y).abs()
-    }
-
-    /// Whether two rectangles come closer than `gap`: no axis of either separates them.
-    fn overlaps(&self, other: &Self, gap: f32) -> bool {
-        let (dx, dy) = (other.centre[0] - self.centre[0], other.centre[1] - self.centre[1]);
-        self.axes().into_iter().chain(other.axes()).all(|axis| {
-            let apart = (dx * axis[0] + dy * axis[1]).abs();
-            apart < self.reach_along(axis) + other.reach_along(axis) + gap
-        })
-    }
-
-    fn turned_into(&self, origin: [f32; 2], turn: f32) -> Self {
-        let (sin, cos) = turn.sin_cos();
-        let [x, y] = self.centre;
-        Self {
-            centre: [origin[0] + cos * x - sin * y, origin[1] + sin * x + cos * y],
-            angle: self.angle + turn,
-            ..*self
-        }
-    }
-}
 
 /// Places that are tried for one piece.
 const TRIES: usize = 30;
-
-type Maker = fn(&mut Draw) -> Piece;
-
-/// What a kind of room contains.
-struct Suite {
-    /// Stand away from the walls, once each, before anything else.
-    middle: &'static [Maker],
-    /// Stand against walls, once each.
-    needed: &'static [Maker],
-    /// Stand against walls.
-    walls: &'static [Maker],
-    /// Stand anywhere, turned by any angle.
-    free: &'static [Maker],
-}
-
-fn suite(kind: RoomKind) -> Suite {
-    match kind {
-        RoomKind::Office => Suite {
-            middle: &[],
-            needed: &[f::desk, f::desk, f::shelf],
-            walls: &[
-                f::desk,
-                f::shelf,
-                f::cabinet,
-                f::drawers,
-                f::wardrobe,
-                f::plant,
-                f::radiator,
-                f::carton_stack,
-            ],
-            free: &[f::desk, f::plant, f::coffee_table, f::office_chair, f::bin, f::carton_stack],
-        },
-        RoomKind::Meeting => Suite {
-            middle: &[f::long_table],
-            needed: &[f::cabinet],
-            walls: &[f::cabinet, f::shelf, f::plant, f::chair, f::radiator, f::drawers, f::floor_lamp],
-            free: &[f::armchair, f::chair, f::plant, f::bin],
-        },
-        RoomKind::Living => Suite {
-            middle: &[f::rug, f::coffee_table],
-            needed: &[f::sofa, f::shelf],
-            walls: &[
-                f::sofa,
-                f::shelf,
-                f::cabinet,
-                f::floor_lamp,
-                f::plant,
-                f::armchair,
-                f::radiator,
-                f::drawers,
-            ],
-            free: &[f::coffee_table, f::armchair, f::dining_table, f::rug, f::plant, f::armchair],
-        },
-        RoomKind::Kitchen => Suite {
-            middle: &[f::dining_table],
-            needed: &[f::kitchen_counter],
-            walls: &[f::cabinet, f::shelf, f::bin, f::radiator, f::drawers, f::plant],
-            free: &[f::dining_table, f::dining_table, f::chair, f::bin],
-        },
-        RoomKind::Bedroom => Suite {
-            middle: &[],
-            needed: &[f::bed, f::wardrobe],
-            walls: &[f::drawers, f::shelf, f::chair, f::floor_lamp, f::desk, f::radiator, f::plant],
-            free: &[f::rug, f::armchair, f::chair, f::carton_stack],
-        },
-        RoomKind::Storage => Suite {
-            middle: &[f::rack],
-            needed: &[f::rack, f::rack],
-            walls: &[f::rack, f::rack, f::shelf, f::carton_stack, f::wardrobe, f::carton_stack],
-            free: &[f::rack, f::carton_stack, f::carton_stack, f::bin, f::chair],
-        },
-        RoomKind::Passage => Suite {
-            middle: &[],
-            needed: &[],
-            walls: &[
-                f::bench,
-                f::cabinet,
-                f::plant,
-                f::bin,
-                f::radiator,
-                f::carton_stack,
-                f::chair,
-                f::drawers,
-            ],
-            free: &[],
-        },
-        RoomKind::Hall => Suite {
-            middle: &[],
-            needed: &[],
-            walls: &[f::bench, f::radiator, f::plant, f::cabinet, f::bench],
-            free: &[f::plant, f::bin, f::chair],
-        },
-    }
-}
 
 /// A room in its own frame: origin in the middle of the floor, x and y along its edges.
 struct Furnisher<'a> {
@@ -392,21 +250,5 @@ impl Furnisher<'_> {
             let at = if axis == 0 { [0.0, aside, height] } else { [aside, 0.0, height] };
             self.solids.extend(pipe.placed(at, if axis == 0 { 0.0 } else { FRAC_PI_2 }));
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn footprints_overlap_exactly_when_no_axis_separates_them() {
-        let a = Footprint { centre: [0.0; 2], half: [1.0, 0.5], angle: 0.0, top: 1.0 };
-        let b =
-            Footprint { centre: [1.9, 0.0], half: [0.8, 0.8], angle: std::f32::consts::FRAC_PI_4, top: 1.0 };
-        assert!(a.overlaps(&b, 0.0), "the corner of b reaches 1.13 m towards a");
-        assert!(!a.overlaps(&Footprint { centre: [2.2, 0.0], ..b }, 0.0));
-        assert!(a.overlaps(&Footprint { centre: [2.2, 0.0], ..b }, 0.1));
-        assert!(a.reaches([1.3, 0.0], 0.4) && !a.reaches([1.3, 0.9], 0.4));
     }
 }

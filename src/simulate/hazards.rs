@@ -5,7 +5,8 @@ use nalgebra::Vector3;
 
 use super::draw::Draw;
 use super::furniture::yaw;
-use super::plan::{Doorway, Opening, OpeningKind, Plan, Room, RoomKind, Wall};
+use super::openings::{Doorway, Opening, OpeningKind};
+use super::plan::{Plan, Room, RoomKind, Wall};
 use super::solid::{Material, Solid};
 use super::walls::part;
 use crate::control::Seed;

@@ -4,7 +4,8 @@
 use nalgebra::Vector3;
 
 use super::furniture::yaw;
-use super::plan::{Opening, OpeningKind, Plan, Wall};
+use super::openings::{Opening, OpeningKind};
+use super::plan::{Plan, Wall};
 use super::solid::{Material, Solid};
 
 /// All solids of the plan, without furniture.
