@@ -14,43 +14,12 @@ const NO_DISTANCE: f64 = 0.05;
 const LEAST_CONTACTS: u32 = 100;
 /// Where a smaller share of them does, the scans are apart, and their fit speaks for nothing.
 const LEAST_OVERLAP: f64 = 0.1;
-/// What a contrast is worth as log-odds: violations, distances. Fitted to right and wrong poses of the same pairs in halls, houses,
+/// What a contrast of two poses is worth as log-odds: of violations, of distances. Fitted to right and wrong poses of the same pairs in halls, houses,
 /// offices and indoor depth-camera scenes.
 const WORTH: (f64, f64) = (1.5, 2.8);
 /// Log-odds from which it decides. It then finds two thirds and more of the wrong poses that look right in halls, and hardly ever takes the right
 /// one for wrong, except in rows of identical rooms, where one pair in four says either.
 const DECISIVE: f64 = 1.0;
-
-/// How much worse one pose is than another at half the voxel: logarithms of ratios, 0 where both are alike.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Contrast {
-    /// Of the shares of judged points that lie in free space.
-    pub violation: f64,
-    /// Of the root mean square distances of surfaces that meet.
-    pub apart: f64,
-}
-
-impl Contrast {
-    /// How much worse the second counts are, both taken with voxels of this size (metres). `None` where too little meets to tell, or so little
-    /// at the first pose that it is no overlap.
-    #[must_use]
-    pub fn between(pose: &Counts, other: &Counts, voxel: f64) -> Option<Self> {
-        let few = pose.inliers.min(other.inliers) < LEAST_CONTACTS;
-        if few || pose.overlap() < LEAST_OVERLAP {
-            return None;
-        }
-        Some(Self {
-            violation: log_violation(other) - log_violation(pose),
-            apart: log_distance(other, voxel) - log_distance(pose, voxel),
-        })
-    }
-
-    /// Whether the other pose is clearly worse.
-    #[must_use]
-    pub fn is_decisive(&self) -> bool {
-        WORTH.0 * self.violation + WORTH.1 * self.apart > DECISIVE
-    }
-}
 
 /// What two scans say of a pose (b to a, local frames) at half the voxel, both directions together, once it is aligned as finely. `None`
 /// where either scan has no finer surfaces ([`Scan::fine`]).
@@ -59,6 +28,21 @@ pub fn look_finely(a: &Scan, b: &Scan, a_from_b: &Pose) -> Option<Counts> {
     let (a, b) = (a.fine()?, b.fine()?);
     let aligned = icp(&a, &b, a_from_b);
     Some(look(&a, &b, &aligned, 1).plus(&look(&b, &a, &aligned.inverse(), 1)))
+}
+
+/// Whether the second counts are clearly worse, both taken with voxels of this size (metres): they say so by the shares of judged points
+/// that lie in free space, and by the root mean square distances of surfaces that meet. Never where too little meets to tell, or so little
+/// at the first pose that it is no overlap.
+#[must_use]
+pub fn is_clearly_worse(pose: &Counts, other: &Counts, voxel: f64) -> bool {
+    let few = pose.inliers.min(other.inliers) < LEAST_CONTACTS;
+    if few || pose.overlap() < LEAST_OVERLAP {
+        return false;
+    }
+    // Logarithms of ratios, 0 where both are alike.
+    let violation = log_violation(other) - log_violation(pose);
+    let apart = log_distance(other, voxel) - log_distance(pose, voxel);
+    WORTH.0 * violation + WORTH.1 * apart > DECISIVE
 }
 
 fn log_violation(counts: &Counts) -> f64 {
@@ -71,20 +55,14 @@ fn log_distance(counts: &Counts, voxel: f64) -> f64 {
     (square + (NO_DISTANCE * voxel).powi(2)).sqrt().ln()
 }
 
-/// Whether the second counts are clearly worse, both taken with voxels of this size (metres).
-#[must_use]
-pub fn is_clearly_worse(pose: &Counts, other: &Counts, voxel: f64) -> bool {
-    Contrast::between(pose, other, voxel).is_some_and(|contrast| contrast.is_decisive())
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::{Rotation3, Vector3};
 
     use super::*;
-    use crate::cloud::ScanKey;
-    use crate::control::{CancelToken, Control, Seed, Silent};
-    use crate::features::{PrepareOptions, SensorPosition, choose_resolution, natural_resolution, prepare};
+    use crate::control::Seed;
+    use crate::features::{PreparedScan, choose_resolution, natural_resolution};
+    use crate::pairwise::test_survey::prepared;
     use crate::simulate::{BuildingOptions, Layout, Sensor, SurveyOptions, simulate};
 
     #[test]
@@ -101,8 +79,12 @@ mod tests {
         for few in [counts(0, 0, 0.0), counts(40, 0, 0.01), counts(2_500, 0, 0.01)] {
             assert!(!is_clearly_worse(&few, &bad, 0.1), "{few:?}");
         }
-        assert_eq!(Contrast::between(&good, &counts(0, 0, 0.0), 0.1), None);
-        assert_eq!(Contrast::between(&Counts::default(), &Counts::default(), 0.1), None);
+        // Nor is one the worse one, whatever it puts into free space.
+        for few in [counts(0, 5_000, 0.0), counts(40, 5_000, 0.03)] {
+            assert!(!is_clearly_worse(&good, &few, 0.1), "{few:?}");
+        }
+        assert!(is_clearly_worse(&good, &counts(400, 5_000, 0.03), 0.1));
+        assert!(!is_clearly_worse(&Counts::default(), &Counts::default(), 0.1));
     }
 
     #[test]
@@ -119,8 +101,6 @@ mod tests {
 
     #[test]
     fn a_hall_that_is_turned_by_half_is_told_from_the_right_one() {
-        let token = CancelToken::new();
-        let control = Control { cancel: &token, observer: &Silent };
         let survey = simulate(&SurveyOptions {
             building: BuildingOptions { layout: Layout::Hall, ..BuildingOptions::default() },
             sensor: Sensor::panoramic(36_000),
@@ -131,17 +111,8 @@ mod tests {
         .expect("the options are valid");
         let natural: Vec<f64> =
             survey.scans.iter().map(|scan| natural_resolution(&scan.cloud.points)).collect();
-        let options = PrepareOptions::at(choose_resolution(&natural), Seed(0));
-        let scans: Vec<(Scan, Pose)> = (1..)
-            .zip(&survey.scans)
-            .map(|(key, scan)| {
-                let prepared =
-                    prepare(ScanKey(key), &scan.cloud, SensorPosition::default(), &options, control)
-                        .expect("the scan is large enough");
-                let model_from_local = scan.model_from_scan * prepared.local_from_scan().inverse();
-                (Scan::new(prepared), model_from_local)
-            })
-            .collect();
+        let resolution = choose_resolution(&natural);
+        let scans = prepared(&survey, resolution);
         // The hall is as long one way as the other from its middle, where the building has its own.
         let middle = survey.scans.iter().fold(Vector3::zeros(), |sum, scan| {
             let points = &scan.cloud.points;
@@ -165,14 +136,14 @@ mod tests {
                 let wrong = model_from_a.inverse() * turned * *model_from_b;
                 let seen = |pose| look_finely(a, b, pose).expect("the scans are fine enough");
                 let (right, turned) = (seen(&truth), seen(&wrong));
-                let voxel = options.resolution / 2.0;
+                let voxel = resolution / 2.0;
                 assert!(!is_clearly_worse(&turned, &right, voxel), "{right:?} {turned:?}");
                 decided += usize::from(is_clearly_worse(&right, &turned, voxel));
             }
         }
         assert!(decided >= 4, "{decided} of 6 pairs tell the ends of the hall apart");
         let (first, second) = (&scans[0].0, &scans[1].0);
-        let bare = Scan::new(crate::features::PreparedScan { fine: None, ..second.prepared.clone() });
+        let bare = Scan::new(PreparedScan { fine: None, ..second.prepared.clone() });
         assert_eq!(look_finely(first, &bare, &Pose::identity()), None);
     }
 }

@@ -75,17 +75,14 @@ fn glance(a: &Scan, b: &Scan, a_from_b: &Pose, points: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::ScanKey;
-    use crate::control::{CancelToken, Control, Seed, Silent};
-    use crate::features::{PrepareOptions, SensorPosition, prepare};
+    use crate::control::Seed;
     use crate::pairwise::mutual_matches;
+    use crate::pairwise::test_survey::prepared;
     use crate::simulate::{Sensor, SurveyOptions, simulate};
 
-    /// A small office seen by a panoramic scanner: each scan with its true pose in the building.
-    fn office() -> Vec<(Scan, Pose)> {
-        let token = CancelToken::new();
-        let control = Control { cancel: &token, observer: &Silent };
-        let survey = simulate(&SurveyOptions {
+    #[test]
+    fn rooms_that_see_each_other_through_a_door_are_found_by_their_planes() {
+        let office = simulate(&SurveyOptions {
             sensor: Sensor::panoramic(20_000),
             stations: 10,
             least_overlap: 0.1,
@@ -93,22 +90,7 @@ mod tests {
             ..SurveyOptions::default()
         })
         .expect("the options are valid");
-        let options = PrepareOptions::at(0.15, Seed(0));
-        (1..)
-            .zip(&survey.scans)
-            .map(|(key, scan)| {
-                let prepared =
-                    prepare(ScanKey(key), &scan.cloud, SensorPosition::default(), &options, control)
-                        .expect("the scan is large enough");
-                let model_from_local = scan.model_from_scan * prepared.local_from_scan().inverse();
-                (Scan::new(prepared), model_from_local)
-            })
-            .collect()
-    }
-
-    #[test]
-    fn rooms_that_see_each_other_through_a_door_are_found_by_their_planes() {
-        let scans = office();
+        let scans = prepared(&office, 0.15);
         let (mut pairs, mut by_matches, mut listed) = (0, 0, 0);
         for (i, (b, model_from_b)) in scans.iter().enumerate() {
             for (a, model_from_a) in &scans[..i] {
