@@ -127,6 +127,53 @@ impl Unpacked {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cloud::{PointCloud, ScanKey};
+    use crate::control::{CancelToken, Control, Seed, Silent};
+    use crate::features::{PrepareOptions, SensorPosition, prepare};
+
+    /// A closed box of 3 m by 3 m by 3 m around the origin with a point every 5 cm, at a resolution in metres, for a scanner that is said to
+    /// have stood at a place.
+    fn room(resolution: f64, sensor: [f64; 3]) -> PreparedScan {
+        let mut cloud = PointCloud::default();
+        let along = |i: usize| 0.05 * i as f32 - 1.475;
+        for (k, i, j) in (0..3).flat_map(|k| (0..3600).map(move |at| (k, at / 60, at % 60))) {
+            for side in [-1.5, 1.5] {
+                let mut point = [side; 3];
+                (point[(k + 1) % 3], point[(k + 2) % 3]) = (along(i), along(j));
+                cloud.points.push(point);
+            }
+        }
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let options = PrepareOptions::at(resolution, Seed(0));
+        prepare(ScanKey(1), &cloud, SensorPosition::Known(sensor), &options, control).expect("a room")
+    }
+
+    #[test]
+    fn only_what_is_dense_at_half_the_voxel_and_seen_from_its_sensor_has_finer_surfaces() {
+        let dense = room(0.2, [0.0; 3]);
+        let finer = dense.fine.as_ref().expect("a point every 5 cm fills voxels of 10 cm");
+        assert!(dense.range_image.is_some() && finer.count() > 3 * dense.points.len());
+        let sparse = room(0.05, [0.0; 3]);
+        assert!(sparse.range_image.is_some() && sparse.fine.is_none(), "nothing is finer than its points");
+        let unseen = room(0.2, [9.0, 8.0, 7.0]);
+        assert!(unseen.range_image.is_none() && unseen.fine.is_none(), "hidden {}", unseen.hidden_share);
+    }
+
+    #[test]
+    fn what_is_forgotten_gives_its_memory_back_and_is_unpacked_anew() {
+        let scan = Scan::new(room(0.2, [0.0; 3]));
+        let first = scan.fine().expect("the room is dense");
+        assert!(Arc::ptr_eq(&first, &scan.fine().expect("it is kept")));
+        let (points, held) = (first.prepared.points.clone(), Arc::downgrade(&first));
+        drop(first);
+        assert!(held.upgrade().is_some(), "it is kept for whoever asks next");
+        scan.forget_fine();
+        assert!(held.upgrade().is_none(), "nobody holds it any more");
+        let again = scan.fine().expect("the room is as dense as before");
+        assert_eq!(again.prepared.points, points);
+        assert!(!Arc::ptr_eq(&again, &scan.clone().fine().expect("a clone unpacks its own")));
+    }
 
     #[test]
     fn what_is_packed_comes_out_as_it_went_in() {
@@ -145,7 +192,7 @@ mod tests {
             .collect();
         let (image, _) = RangeImage::render(&points, [0.0; 3], 0.1);
         let surface = FineSurface::new(&points, &normals, image, 0.1).expect("a step is small");
-        let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(crate::cloud::ScanKey(1)) };
+        let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(ScanKey(1)) };
         let scan = surface.unpack(&of);
         assert!((scan.prepared.resolution - 0.1).abs() < 1e-12);
         for (i, (point, normal)) in points.iter().zip(&normals).enumerate() {
@@ -159,7 +206,7 @@ mod tests {
     #[test]
     fn what_cannot_be_packed_well_is_not_packed() {
         let (image, _) = RangeImage::render(&[[1.0, 0.0, 0.0]], [0.0; 3], 0.1);
-        let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(crate::cloud::ScanKey(1)) };
+        let of = PreparedScan { resolution: 0.2, ..PreparedScan::empty(ScanKey(1)) };
         assert!(FineSurface::new(&[], &[], image.clone(), 0.1).is_none());
         let one = FineSurface::new(&[[1.0, 2.0, 3.0]], &[[0.0, 0.0, 1.0]], image.clone(), 0.1);
         assert_eq!(one.expect("one point").unpack(&of).prepared.points, [[1.0, 2.0, 3.0]]);

@@ -1,7 +1,7 @@
 //! A scan made ready for matching: everything the pair and mapping layers read, in two forms. [`PreparedScan`] is plain data, to be
 //! stored; [`Scan`] adds the lookup grid, to be computed with.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -168,8 +168,7 @@ pub struct Scan {
     pub centroid: Vector3<f64>,
     /// Root mean square distance of the points from their mean, metres.
     pub rms_radius: f64,
-    /// Its planes, where its normals concentrate in three orthogonal directions.
-    pub planes: Option<PlaneProfile>,
+    planes: OnceLock<Option<PlaneProfile>>,
     unpacked: Unpacked,
 }
 
@@ -182,8 +181,21 @@ impl Scan {
         let position = |p: &Point| Vector3::from(*p).cast::<f64>();
         let centroid = prepared.points.iter().map(position).sum::<Vector3<f64>>() / n;
         let square = prepared.points.iter().map(|p| (position(p) - centroid).norm_squared()).sum::<f64>() / n;
-        let planes = PlaneProfile::of(&prepared.points, &prepared.normals, prepared.resolution as f32);
-        Self { prepared, grid, centroid, rms_radius: square.sqrt(), planes, unpacked: Unpacked::default() }
+        Self {
+            prepared,
+            grid,
+            centroid,
+            rms_radius: square.sqrt(),
+            planes: OnceLock::new(),
+            unpacked: Unpacked::default(),
+        }
+    }
+
+    /// Its planes, where its normals concentrate in three orthogonal directions; found when they are first asked for.
+    #[must_use]
+    pub fn planes(&self) -> Option<&PlaneProfile> {
+        let PreparedScan { points, normals, resolution, .. } = &self.prepared;
+        self.planes.get_or_init(|| PlaneProfile::of(points, normals, *resolution as f32)).as_ref()
     }
 
     /// The same scan at half the voxel, surfaces alone; `None` where the data are no finer. It stays in memory until

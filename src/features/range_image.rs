@@ -1,6 +1,8 @@
 //! What a sensor saw, as a cube map of depths: six pinhole faces around the sensor, so that a depth camera and a
 //! panoramic scanner are the same code and no direction is special.
 
+use std::sync::Arc;
+
 use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
@@ -40,13 +42,13 @@ struct Face {
     depths: Vec<f32>,
 }
 
-/// The range image of a scan as seen from one point.
+/// The range image of a scan as seen from one point. Clones share its pixels.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct RangeImage {
     sensor: Point,
     pixel: f32,
     margin: f32,
-    faces: Vec<Face>,
+    faces: Arc<[Face]>,
 }
 
 impl RangeImage {

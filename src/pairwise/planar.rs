@@ -16,7 +16,7 @@ const PEAKS: usize = 10;
 /// a from b in the local frames. None where either scan has no plane profile, and none that would tip a scan over.
 #[must_use]
 pub fn planar_poses(a: &Scan, b: &Scan, keep: usize) -> Vec<Pose> {
-    let (Some(in_a), Some(in_b)) = (&a.planes, &b.planes) else { return Vec::new() };
+    let (Some(in_a), Some(in_b)) = (a.planes(), b.planes()) else { return Vec::new() };
     let shifts = Shifts::between(in_a, in_b);
     let mut combined: Vec<(u32, usize, [i32; 3])> = Vec::new();
     let turns = quarter_turns();

@@ -184,7 +184,7 @@ pub fn prepared(mut input: &[u8]) -> String {
                 assert!(finer.prepared.points.iter().flatten().all(|x| x.is_finite()));
                 assert!(finer.prepared.normals.iter().flatten().all(|x| x.is_finite()));
             }
-            let planes = scan.planes.is_some();
+            let planes = scan.planes().is_some();
             format!("prepared, planes {planes}")
         }
         Err(error) => error.to_string(),
