@@ -1,5 +1,5 @@
 //! The surfaces of a scan at half its voxel, for second looks: where two poses of a pair both look right, what tells them apart is often
-//! smaller than a voxel. Few pairs need it, so its points are kept packed, and unpacked while joins are weighed and pairs that contradict are heard.
+//! smaller than a voxel. Its points are kept packed, and unpacked where poses of a pair rival each other, joins are weighed or pairs that contradict are heard.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

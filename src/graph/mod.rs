@@ -9,5 +9,5 @@ mod support;
 
 pub use centrality::harmonic_centrality;
 pub use retrieval::{Retrieval, retrieve};
-pub use scan_graph::{Edge, ScanGraph, Supported, softplus};
+pub use scan_graph::{Edge, ScanGraph, Supported, evidence, softplus};
 pub use support::{SupportOptions, triplet_features};

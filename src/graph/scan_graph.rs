@@ -13,6 +13,9 @@ use crate::features::Scan;
 use crate::geometry::Pose;
 use crate::pairwise::{Hypothesis, PairKey, PairResult, Probe, match_pair, probe};
 
+/// Pairs that are matched before the memory that their second looks took is given back.
+const BLOCK: usize = 512;
+
 /// A hypothesis with what third scans say of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Supported {
@@ -52,10 +55,20 @@ impl Edge {
     }
 }
 
-/// `ln(1 + e^x)`: what a hypothesis of log-odds x is worth as evidence.
+/// `ln(1 + e^x)`: log-odds x without what speaks against.
 #[must_use]
 pub fn softplus(x: f64) -> f64 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()
+}
+
+/// The most that one pair says for a pose: as much as makes a join firm, and half of what the strictest level asks. Its log-odds may be
+/// higher, but the verifier was not fitted on places that look alike from two sides; no pair outweighs several that say otherwise.
+const MOST_EVIDENCE: f64 = 4.0;
+
+/// What one pair says for a pose of these log-odds, as evidence that adds up over pairs.
+#[must_use]
+pub fn evidence(log_odds: f64) -> f64 {
+    softplus(log_odds).min(MOST_EVIDENCE)
 }
 
 /// All scans of a project and all pairs tried. Iteration is always in ascending order of keys.
@@ -147,16 +160,21 @@ impl ScanGraph {
             .collect();
         let matching = control.begin(Stage::Match);
         let done = std::sync::atomic::AtomicUsize::new(0);
-        let results: Vec<PairResult> = fresh
-            .par_iter()
-            .map(|(a, b)| {
-                control.check()?;
-                let result = match_pair(a, b, &options.verifier);
-                let finished = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
-                control.report(Stage::Match, finished, fresh.len());
-                Ok(result)
-            })
-            .collect::<Result<_, Cancelled>>()?;
+        let mut results: Vec<PairResult> = Vec::with_capacity(fresh.len());
+        for block in fresh.chunks(BLOCK) {
+            let matched: Result<Vec<PairResult>, Cancelled> = block
+                .par_iter()
+                .map(|(a, b)| {
+                    control.check()?;
+                    let result = match_pair(a, b, &options.verifier);
+                    let finished = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
+                    control.report(Stage::Match, finished, fresh.len());
+                    Ok(result)
+                })
+                .collect();
+            self.forget_fine();
+            results.extend(matched?);
+        }
         drop(matching);
         let _supporting = control.begin(Stage::Support);
         self.add_results(results.iter().cloned(), options);

@@ -12,12 +12,12 @@ use super::gravity::Gravity;
 use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
-use crate::graph::{ScanGraph, softplus};
+use crate::graph::{ScanGraph, evidence};
 
 /// Hypotheses with less evidence than this propose nothing.
 const LEAST_EVIDENCE: f64 = 0.03;
 /// An edge with this evidence says something: a likelihood of 0.63.
-const LEAST_WORD: f64 = 1.0;
+pub const LEAST_WORD: f64 = 1.0;
 /// Proposals that are tried as the centre of a cluster, at most.
 const MAX_CENTRES: usize = 200;
 
@@ -35,13 +35,13 @@ pub struct Proposal {
     pub in_b: ScanKey,
     /// The hypothesis, from the local frame of `in_b` to that of `in_a`.
     pub in_a_from_in_b: Pose,
-    /// softplus(score).
+    /// What its pair says for it, with the word of third scans.
     pub evidence: f64,
     /// What the hypothesis is worth to a rival: the same, or what the pair alone says if that is more. Third scans that are themselves
     /// misplaced can talk a score down, so a rival keeps its own word.
     pub doubt: f64,
     /// Centroid of `in_b` in the frame of b, metres: where distances between poses are measured.
-    centroid: Vector3<f64>,
+    pub(super) centroid: Vector3<f64>,
 }
 
 /// The best cluster of proposals.
@@ -91,8 +91,8 @@ pub fn proposals(graph: &ScanGraph, a: &Component, b: &Component) -> Vec<Proposa
                 continue;
             };
             for (motion, h) in edge.motions_from(*in_b) {
-                let evidence = softplus(h.score);
-                let doubt = softplus(h.score.max(h.hypothesis.logit));
+                let said = evidence(h.score);
+                let doubt = evidence(h.score.max(h.hypothesis.logit));
                 if doubt > LEAST_EVIDENCE {
                     let a_from_b = *a_from_local * motion * local_from_b;
                     found.push(Proposal {
@@ -100,7 +100,7 @@ pub fn proposals(graph: &ScanGraph, a: &Component, b: &Component) -> Vec<Proposa
                         in_a,
                         in_b: *in_b,
                         in_a_from_in_b: motion,
-                        evidence,
+                        evidence: said,
                         doubt,
                         centroid,
                     });

@@ -8,7 +8,7 @@ use super::component::Component;
 use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
-use crate::graph::{Edge, ScanGraph, softplus};
+use crate::graph::{Edge, ScanGraph, evidence};
 use crate::pairwise::centred_difference;
 
 /// An adjustment threw a scan when it keeps less than this share of its support …
@@ -27,7 +27,7 @@ pub fn edge_support(graph: &ScanGraph, edge: &Edge, a_from_b: &Pose, options: &M
             let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, a_from_b, &b.centroid);
             angle < options.cluster_angle && distance < reach
         })
-        .map(|h| softplus(h.score))
+        .map(|h| evidence(h.score))
         .fold(0.0, f64::max)
 }
 

@@ -138,6 +138,12 @@ pub fn separating_cut(
             spare[j * n + i] += support;
         }
     }
+    let (side, flow) = least_cut(&mut spare, n, source, sink)?;
+    Some((side.into_iter().map(|i| keys[i]).collect(), flow))
+}
+
+/// The same for `n` nodes with what can flow from i to j at `spare[i * n + j]`, which is used up: the side of the source, and what flows.
+pub fn least_cut(spare: &mut [f64], n: usize, source: usize, sink: usize) -> Option<(Vec<usize>, f64)> {
     let mut flow = 0.0;
     loop {
         let mut before: Vec<Option<usize>> = vec![None; n];
@@ -152,7 +158,7 @@ pub fn separating_cut(
             }
         }
         if before[sink].is_none() {
-            let side = (0..n).filter(|i| before[*i].is_some()).map(|i| keys[i]).collect();
+            let side = (0..n).filter(|i| before[*i].is_some()).collect();
             return Some((side, flow));
         }
         let mut path = Vec::new();

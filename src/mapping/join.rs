@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use nalgebra::Vector3;
 
 use super::candidates::{Backing, Candidate, near, support_of};
+use super::close_look::objection;
 use super::component::Component;
 use super::gravity::Gravity;
 use super::options::{JoinLevel, MappingOptions};
@@ -168,6 +169,13 @@ pub fn weigh_join(
         }
         match place(candidate, level.support, if several { 2 } else { 1 }) {
             Ok(placed) => {
+                // What is joined already, and only weighed again, need not show as much.
+                if level.support > 0.0
+                    && let Some(refusal) = objection(graph, (a, b), candidate, placed.edges, &placed.a_from_b)
+                {
+                    first_refusal = first_refusal.or(Some(refusal));
+                    continue;
+                }
                 let margin = |rival: f64| placed.support - options.rival_share * rival;
                 // Rivals are looked at only as far as they matter.
                 let feared = candidates

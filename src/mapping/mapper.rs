@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::bent_join::bent_join;
 use super::candidates::{CLUSTERS, Candidate, candidates};
+use super::close_look::FEW;
 use super::component::Component;
 use super::consistency::supports;
 use super::cuts::loose_side;
@@ -253,6 +254,7 @@ impl Mapper {
                 }
                 Err(refusal) => {
                     if let Refusal::Violation { .. } = refusal
+                        && candidate.members.len() > FEW
                         && let Some(joined) =
                             bent_join(graph, (first, second), candidate, level, voxel, options, control)?
                     {

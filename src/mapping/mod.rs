@@ -7,7 +7,9 @@
 //! and joint dense adjustment; `track_refinement` moves keypoints; `mapper` has one method a step and `policy` their order.
 
 mod bent_join;
+mod bridges;
 mod candidates;
+mod close_look;
 mod component;
 mod consistency;
 mod cuts;
@@ -15,6 +17,7 @@ mod decision;
 mod filter;
 mod gravity;
 mod guarded;
+mod hearing;
 mod initial_pair;
 mod intrusion;
 mod join;
@@ -28,6 +31,8 @@ mod refine;
 mod refusals;
 mod snapshot;
 mod surfaces;
+#[cfg(test)]
+mod test_hall;
 mod testimony;
 mod track_refinement;
 mod tracks;

@@ -79,6 +79,12 @@ impl MappingOptions {
         a > 1 && b > 1 && !self.is_strictest(level)
     }
 
+    /// The strictest level alone.
+    #[must_use]
+    pub fn strictest_level(&self) -> &[JoinLevel] {
+        &self.levels[..self.levels.len().min(1)]
+    }
+
     /// The levels at which joins are firm: what they put together needs no second thought.
     #[must_use]
     pub fn firm_levels(&self) -> &[JoinLevel] {
@@ -117,5 +123,20 @@ impl Default for MappingOptions {
             refine_joins: 4,
             decisions: Decisions::default(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::graph::evidence;
+
+    #[test]
+    fn one_sure_pair_makes_a_firm_join_and_two_one_of_the_strictest_level() {
+        let options = MappingOptions::default();
+        let sure = evidence(50.0);
+        assert!((sure - options.firm_support).abs() < 1e-12);
+        assert!((2.0 * sure - options.strictest_level()[0].support).abs() < 1e-12);
+        assert!(evidence(0.0) < evidence(2.0) && evidence(2.0) < sure && evidence(-9.0) >= 0.0);
     }
 }

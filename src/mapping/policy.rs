@@ -4,7 +4,8 @@
 //! a component from an initial pair. Any success goes back to the strictest level, because the model has grown and what waited may
 //! now be well supported. When nothing fits, misplaced scans are filtered and tried again, and retrieval widens for what stays apart.
 //! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. Where
-//! alike places were found, none but firm ones are made from then on. What is left waits.
+//! alike places were found, none but those of the strictest level are made from then on, which no single pair passes. Pieces that a single weak pair
+//! turns out to hold together are parted at the end. What is left waits.
 
 use std::collections::BTreeSet;
 
@@ -31,8 +32,13 @@ pub fn grow(
     let mut options = options.clone();
     let mut weakly = false;
     loop {
-        let all = weakly && mapper.doubted.is_empty();
-        let levels = if all { &options.levels } else { options.firm_levels() };
+        let levels = if !mapper.doubted.is_empty() {
+            options.strictest_level()
+        } else if weakly {
+            &options.levels
+        } else {
+            options.firm_levels()
+        };
         join_all(mapper, graph, levels, voxel, &options, control)?;
         if mapper.filter_scans(graph, voxel, &options, control)? > 0 {
             continue;
@@ -58,6 +64,7 @@ pub fn grow(
             break;
         }
     }
+    mapper.part_at_bridges(graph, &options, control)?;
     if mapper.refinement_is_due(&options) {
         mapper.refine(graph, voxel, &options, control)?;
     }

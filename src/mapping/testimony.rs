@@ -2,15 +2,16 @@
 //! voice.
 
 use super::component::Component;
+use super::hearing::is_believable;
 use super::options::MappingOptions;
-use super::voice::{Voice, Word, one_voice};
+use super::voice::{Voice, Word, loudest, one_voice};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
-use crate::graph::{ScanGraph, softplus};
+use crate::graph::{ScanGraph, evidence};
 use crate::pairwise::{PairKey, centred_difference, is_clearly_worse, look_finely};
 
-/// A pair says that much by itself (softplus of its log-odds) when it counts as a witness: a likelihood of 0.86.
+/// A pair says that much by itself when it counts as a witness: a likelihood of 0.86.
 const WITNESS: f64 = 2.0;
 /// A pair speaks against a component only if its pose differs by this many times what makes a rival.
 pub const CLEARLY_DIFFERENT: f64 = 2.0;
@@ -21,6 +22,8 @@ const CONTRADICTED_WEIGHT: f64 = 0.03;
 const CONTRADICTED_LEAST: f64 = 3.0;
 /// … by at least this many pairs.
 const CONTRADICTED_PAIRS: usize = 2;
+/// Voices that are given a hearing; if there are more, the next is believed.
+const HEARINGS: usize = 12;
 
 /// A pair of scans in one component whose own evidence is for another pose than the one they have.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -29,7 +32,7 @@ pub struct Contradiction {
     pub pair: PairKey,
     /// The other pose, between the local frames of the pair's scans.
     pub a_from_b: Pose,
-    /// softplus of the log-odds of the other pose, by the pair alone.
+    /// What the pair alone says for the other pose.
     pub evidence: f64,
     /// Angle between the two poses, radians.
     pub angle: f64,
@@ -51,7 +54,8 @@ pub struct Testimony {
 
 impl Testimony {
     /// Asks the pairs that contradict again, with a second look, if several speak with the voice that weighs most. A pair whose scans fit
-    /// clearly better where they are than where it would have them is no witness.
+    /// clearly better where they are than where it would have them is no witness. What is still said with so much weight that the component
+    /// could not stand is given a hearing, voice by voice, and ignored where it is not believable of any of the scans.
     pub fn cross_examine(
         &mut self,
         graph: &ScanGraph,
@@ -71,6 +75,18 @@ impl Testimony {
         }
         self.contradictions = upheld;
         self.listen(graph, component, options);
+        for _ in 0..HEARINGS {
+            if !self.condemns() {
+                break;
+            }
+            let words = Word::both_ways(graph, component, &self.contradictions, options);
+            let voice = loudest(&words, options.rival_angle);
+            if is_believable(graph, component, &voice, options, control)? {
+                break;
+            }
+            self.contradictions.retain(|c| voice.iter().all(|word| word.pair() != c.pair));
+            self.listen(graph, component, options);
+        }
         Ok(())
     }
 
@@ -116,15 +132,16 @@ pub fn testimony(graph: &ScanGraph, component: &Component, options: &MappingOpti
             let mut other: Option<Contradiction> = None;
             for h in &edge.hypotheses {
                 let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, &now, &scan.centroid);
-                let evidence = softplus(h.hypothesis.logit);
+                let said = evidence(h.hypothesis.logit);
                 if angle < options.rival_angle && distance < reach {
-                    agreeing = agreeing.max(evidence).max(softplus(h.score));
+                    agreeing = agreeing.max(said).max(evidence(h.score));
                 } else if (angle > CLEARLY_DIFFERENT * options.rival_angle
                     || distance > CLEARLY_DIFFERENT * reach)
-                    && other.is_none_or(|known| evidence > known.evidence)
+                    && other.is_none_or(|known| said > known.evidence)
                 {
                     let a_from_b = h.hypothesis.a_from_b;
-                    other = Some(Contradiction { pair: edge.pair, a_from_b, evidence, angle, distance });
+                    other =
+                        Some(Contradiction { pair: edge.pair, a_from_b, evidence: said, angle, distance });
                 }
             }
             match other {
@@ -153,6 +170,7 @@ fn is_refuted(graph: &ScanGraph, component: &Component, contradiction: &Contradi
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mapping::test_hall::Model;
 
     #[test]
     fn what_pairs_say_by_chance_does_not_add_up_but_one_voice_condemns() {
@@ -163,15 +181,30 @@ mod tests {
             angle: 3.0,
             distance: 4.0,
         };
-        let contradictions: Vec<Contradiction> = [8.0, 6.0, 5.0, 4.0].map(said).to_vec();
+        let contradictions: Vec<Contradiction> = [4.0, 4.0, 3.5, 3.0].map(said).to_vec();
         let voiced = |pairs: usize, evidence: f64| Testimony {
             agreeing: 100,
             contradictions: contradictions.clone(),
             voice: Voice { pairs, evidence },
         };
-        assert!(!voiced(1, 8.0).condemns());
-        assert!(voiced(3, 15.0).condemns());
+        assert!(!voiced(1, 4.0).condemns());
+        assert!(voiced(3, 11.0).condemns());
         // Two that hardly believe it themselves are still chance.
         assert!(!voiced(2, 4.5).condemns());
+    }
+    #[test]
+    fn a_second_look_refutes_pairs_that_a_hall_misleads_and_no_others() {
+        let model = Model::new(5);
+        let refuted = |component: &Component, said: &[Contradiction]| {
+            said.iter().filter(|c| is_refuted(&model.graph, component, c) == Some(true)).count()
+        };
+        let pairs = [(1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5), (3, 4), (3, 5), (4, 5)];
+        let misled: Vec<Contradiction> = pairs.iter().map(|p| model.contradiction(*p, false)).collect();
+        let found = refuted(&model.component, &misled);
+        assert!(found >= 6, "{found} of 10");
+        let of_the_turned = pairs.iter().filter(|(_, b)| *b == 5);
+        let right: Vec<Contradiction> = of_the_turned.map(|p| model.contradiction(*p, true)).collect();
+        assert_eq!(refuted(&model.with_turned(&[5]), &right), 0);
+        assert_eq!(is_refuted(&model.coarse(), &model.component, &misled[0]), None);
     }
 }

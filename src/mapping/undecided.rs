@@ -14,11 +14,11 @@ use super::testimony::{CLEARLY_DIFFERENT, Contradiction, Testimony};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
-use crate::graph::{ScanGraph, softplus};
+use crate::graph::{ScanGraph, evidence};
 use crate::pairwise::centred_difference;
 
 /// A runner-up with this share of the support is nearly as good.
-const NEARLY_AS_GOOD: f64 = 0.65;
+const NEARLY_AS_GOOD: f64 = 0.5;
 /// Contradictions from which a cut is sought, the strongest first.
 const TRIED: usize = 8;
 /// Evidence for another pose below this is noise: a likelihood of 0.63.
@@ -194,9 +194,9 @@ fn vote(
     for h in &edge.hypotheses {
         let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, &now, &scan.centroid);
         if angle > options.rival_angle || distance > reach {
-            doubt = doubt.max(softplus(h.score.max(h.hypothesis.logit)));
+            doubt = doubt.max(evidence(h.score.max(h.hypothesis.logit)));
         } else {
-            support = support.max(softplus(h.score));
+            support = support.max(evidence(h.score));
         }
     }
     Some(NEARLY_AS_GOOD * support - if doubt > LEAST_DOUBT { doubt } else { 0.0 })

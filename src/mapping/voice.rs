@@ -18,8 +18,10 @@ use crate::pairwise::{PairKey, centred_difference};
 pub struct Word {
     /// The pair that says it.
     pair: PairKey,
+    /// Which of its scans would move.
+    moves: ScanKey,
     /// From where the scan is to where it would be, in the frame of the component.
-    motion: Pose,
+    pub motion: Pose,
     /// Centroid of the scan, metres, in the frame of the component.
     centroid: Vector3<f64>,
     /// Motions this far apart at the centroid are different, metres.
@@ -51,6 +53,7 @@ impl Word {
         let scan = graph.scan(moves)?;
         Some(Self {
             pair: contradiction.pair,
+            moves,
             motion: *stays * stays_from_moves * from_local.inverse(),
             centroid: from_local.transform(&scan.centroid),
             reach: options.rival_voxels * scan.prepared.resolution,
@@ -84,6 +87,24 @@ impl Word {
         ways.filter_map(|(c, moves)| Self::new(graph, component, c, moves, options)).collect()
     }
 
+    /// The pair that says it.
+    #[must_use]
+    pub fn pair(&self) -> PairKey {
+        self.pair
+    }
+
+    /// The scan that would move.
+    #[must_use]
+    pub fn moves(&self) -> ScanKey {
+        self.moves
+    }
+
+    /// The scan of the pair that would stay.
+    #[must_use]
+    pub fn stays(&self) -> ScanKey {
+        if self.pair.a == self.moves { self.pair.b } else { self.pair.a }
+    }
+
     fn agrees(&self, other: &Self, angle: f64) -> bool {
         let (turn, distance) = centred_difference(&self.motion, &other.motion, &self.centroid);
         turn < angle && distance < self.reach
@@ -93,15 +114,24 @@ impl Word {
 /// Of several words, those that agree and weigh most together. A pair counts once, whichever way it is told. `angle` in radians.
 #[must_use]
 pub fn one_voice(words: &[Word], angle: f64) -> Voice {
+    let mut voice = Voice::default();
+    for word in loudest(words, angle) {
+        voice.pairs += 1;
+        voice.evidence += word.evidence;
+    }
+    voice
+}
+
+/// The words of that voice, first the one that the others agree with.
+#[must_use]
+pub fn loudest(words: &[Word], angle: f64) -> Vec<&Word> {
     let voices = words.iter().map(|x| {
-        let mut heard = BTreeSet::new();
-        let agreeing = words.iter().filter(|y| x.agrees(y, angle) && heard.insert(y.pair));
-        agreeing.fold(Voice::default(), |sum, y| Voice {
-            pairs: sum.pairs + 1,
-            evidence: sum.evidence + y.evidence,
-        })
+        let mut heard = BTreeSet::from([x.pair]);
+        let others = words.iter().filter(|y| x.agrees(y, angle) && heard.insert(y.pair));
+        let voice: Vec<&Word> = std::iter::once(x).chain(others).collect();
+        (voice.iter().map(|word| word.evidence).sum::<f64>(), voice)
     });
-    voices.max_by(|x, y| x.evidence.total_cmp(&y.evidence)).unwrap_or_default()
+    voices.max_by(|x, y| x.0.total_cmp(&y.0)).map(|(_, voice)| voice).unwrap_or_default()
 }
 
 #[cfg(test)]
@@ -112,7 +142,14 @@ mod tests {
 
     fn word(b: u128, motion: Pose, centroid: f64, evidence: f64) -> Word {
         let pair = PairKey::of(ScanKey(1), ScanKey(b));
-        Word { pair, motion, centroid: Vector3::new(centroid, 0.0, 0.0), reach: 0.5, evidence }
+        Word {
+            pair,
+            moves: ScanKey(b),
+            motion,
+            centroid: Vector3::new(centroid, 0.0, 0.0),
+            reach: 0.5,
+            evidence,
+        }
     }
 
     fn turned(x: f64) -> Pose {

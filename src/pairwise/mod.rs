@@ -14,7 +14,7 @@ mod probe;
 mod second_look;
 mod shortlist;
 #[cfg(test)]
-mod test_survey;
+pub(crate) mod test_survey;
 mod verifier;
 
 pub use appearance::{Appearance, appearance};
@@ -27,7 +27,7 @@ pub use matching::{Match, mutual_matches};
 pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};
 pub use planar::planar_poses;
 pub use probe::{Probe, probe};
-pub use second_look::{is_clearly_worse, look_finely};
+pub use second_look::{is_clearly_worse, look_finely, look_leniently, preference};
 pub use shortlist::shortlist;
 pub use verifier::{
     Evidence, FEATURES, FittedScene, Logistic, Provenance, TRIPLET_FEATURES, Verifier, VerifierError,

@@ -8,6 +8,7 @@ use super::dense::look;
 use super::gravity::is_upright;
 use super::icp::icp;
 use super::matching::mutual_matches;
+use super::second_look::contest;
 use super::shortlist::shortlist;
 use super::verifier::{Evidence, Verifier};
 use crate::cloud::ScanKey;
@@ -46,7 +47,7 @@ pub struct Hypothesis {
     pub a_from_b: Pose,
     /// What was counted.
     pub evidence: Evidence,
-    /// Log-odds that the pose is right, from the pair alone.
+    /// Log-odds that the pose is right, from the pair alone: of the verifier, less what a second look takes.
     pub logit: f64,
 }
 
@@ -90,6 +91,7 @@ pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
         let logit = verifier.pair_logit(&evidence, a.prepared.resolution);
         hypotheses.push(Hypothesis { a_from_b, evidence, logit });
     }
+    contest(a, b, &mut hypotheses);
     hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));
     PairResult { pair, matches: matches.iter().map(|m| (m.a, m.b)).collect(), hypotheses }
 }

@@ -3,6 +3,7 @@
 
 use super::dense::{Counts, look};
 use super::icp::icp;
+use super::pair::Hypothesis;
 use crate::features::Scan;
 use crate::geometry::Pose;
 
@@ -21,6 +22,14 @@ const WORTH: (f64, f64) = (1.5, 2.8);
 /// one for wrong, except in rows of identical rooms, where one pair in four says either.
 const DECISIVE: f64 = 1.0;
 
+/// Poses of a pair with less log-odds than this are out of the running, …
+const LEAST: f64 = -3.0;
+/// … and those that are this far behind the likeliest.
+const BEHIND: f64 = 6.0;
+/// What the log-odds of a pose are lowered by that clearly loses against another. Those of the other are left as they are: both may be
+/// wrong.
+const LOST: f64 = 4.0;
+
 /// What two scans say of a pose (b to a, local frames) at half the voxel, both directions together, once it is aligned as finely. `None`
 /// where either scan has no finer surfaces ([`Scan::fine`]).
 #[must_use]
@@ -30,19 +39,55 @@ pub fn look_finely(a: &Scan, b: &Scan, a_from_b: &Pose) -> Option<Counts> {
     Some(look(&a, &b, &aligned, 1).plus(&look(&b, &a, &aligned.inverse(), 1)))
 }
 
-/// Whether the second counts are clearly worse, both taken with voxels of this size (metres): they say so by the shares of judged points
-/// that lie in free space, and by the root mean square distances of surfaces that meet. Never where too little meets to tell, or so little
-/// at the first pose that it is no overlap.
+/// The same, or what they say where they are without being aligned, whichever puts less into free space. Alignment can slide where little
+/// overlaps; without it, what is a little off violates a little.
 #[must_use]
-pub fn is_clearly_worse(pose: &Counts, other: &Counts, voxel: f64) -> bool {
-    let few = pose.inliers.min(other.inliers) < LEAST_CONTACTS;
-    if few || pose.overlap() < LEAST_OVERLAP {
-        return false;
+pub fn look_leniently(a: &Scan, b: &Scan, a_from_b: &Pose) -> Option<Counts> {
+    let aligned = look_finely(a, b, a_from_b)?;
+    let (a, b) = (a.fine()?, b.fine()?);
+    let plain = look(&a, &b, a_from_b, 1).plus(&look(&b, &a, &a_from_b.inverse(), 1));
+    Some(if plain.violation_share() < aligned.violation_share() { plain } else { aligned })
+}
+
+/// Log-odds of one pose over another, from counts taken with voxels of this size (metres): by the shares of judged points that lie in free
+/// space, and by the root mean square distances of surfaces that meet. Zero where too little meets to tell, or so little at the better pose
+/// that it is no overlap.
+#[must_use]
+pub fn preference(pose: &Counts, other: &Counts, voxel: f64) -> f64 {
+    if pose.inliers.min(other.inliers) < LEAST_CONTACTS {
+        return 0.0;
     }
     // Logarithms of ratios, 0 where both are alike.
     let violation = log_violation(other) - log_violation(pose);
     let apart = log_distance(other, voxel) - log_distance(pose, voxel);
-    WORTH.0 * violation + WORTH.1 * apart > DECISIVE
+    let worth = WORTH.0 * violation + WORTH.1 * apart;
+    let better = if worth > 0.0 { pose } else { other };
+    if better.overlap() < LEAST_OVERLAP { 0.0 } else { worth }
+}
+
+/// Whether the second counts are clearly worse, both taken with voxels of this size (metres).
+#[must_use]
+pub fn is_clearly_worse(pose: &Counts, other: &Counts, voxel: f64) -> bool {
+    preference(pose, other, voxel) > DECISIVE
+}
+
+/// Looks again at the poses of a pair that are in the running, if there are several, and lowers the log-odds of those that are clearly
+/// worse than another.
+pub(super) fn contest(a: &Scan, b: &Scan, hypotheses: &mut [Hypothesis]) {
+    let best = hypotheses.iter().map(|h| h.logit).fold(f64::NEG_INFINITY, f64::max);
+    let runs = |h: &&mut Hypothesis| h.logit > LEAST.max(best - BEHIND);
+    let mut running: Vec<&mut Hypothesis> = hypotheses.iter_mut().filter(runs).collect();
+    if running.len() < 2 {
+        return;
+    }
+    let voxel = a.prepared.resolution / 2.0;
+    let seen: Option<Vec<Counts>> = running.iter().map(|h| look_finely(a, b, &h.a_from_b)).collect();
+    let Some(seen) = seen else { return };
+    for (hypothesis, mine) in running.iter_mut().zip(&seen) {
+        if seen.iter().any(|other| is_clearly_worse(other, mine, voxel)) {
+            hypothesis.logit -= LOST;
+        }
+    }
 }
 
 fn log_violation(counts: &Counts) -> f64 {
@@ -57,13 +102,10 @@ fn log_distance(counts: &Counts, voxel: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Rotation3, Vector3};
-
     use super::*;
-    use crate::control::Seed;
-    use crate::features::{PreparedScan, choose_resolution, natural_resolution};
-    use crate::pairwise::test_survey::prepared;
-    use crate::simulate::{BuildingOptions, Layout, Sensor, SurveyOptions, simulate};
+    use crate::features::PreparedScan;
+    use crate::pairwise::Evidence;
+    use crate::pairwise::test_survey::{Hall, hall};
 
     #[test]
     fn a_pose_at_which_little_meets_is_never_the_better_one() {
@@ -101,34 +143,7 @@ mod tests {
 
     #[test]
     fn a_hall_that_is_turned_by_half_is_told_from_the_right_one() {
-        let survey = simulate(&SurveyOptions {
-            building: BuildingOptions { layout: Layout::Hall, ..BuildingOptions::default() },
-            sensor: Sensor::panoramic(36_000),
-            stations: 4,
-            seed: Seed(3),
-            ..SurveyOptions::default()
-        })
-        .expect("the options are valid");
-        let natural: Vec<f64> =
-            survey.scans.iter().map(|scan| natural_resolution(&scan.cloud.points)).collect();
-        let resolution = choose_resolution(&natural);
-        let scans = prepared(&survey, resolution);
-        // The hall is as long one way as the other from its middle, where the building has its own.
-        let middle = survey.scans.iter().fold(Vector3::zeros(), |sum, scan| {
-            let points = &scan.cloud.points;
-            let edge = |k: usize, least: bool| {
-                let along =
-                    points.iter().map(|p| scan.model_from_scan.transform(&Vector3::from(*p).cast())[k]);
-                if least {
-                    along.fold(f64::INFINITY, f64::min)
-                } else {
-                    along.fold(f64::NEG_INFINITY, f64::max)
-                }
-            };
-            sum + Vector3::new(edge(0, true) + edge(0, false), edge(1, true) + edge(1, false), 0.0)
-        }) / (2.0 * survey.scans.len() as f64);
-        let half = Rotation3::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI);
-        let turned = Pose::new(half, middle - half * middle);
+        let Hall { scans, resolution, turned } = hall(4);
         let mut decided = 0;
         for (i, (b, model_from_b)) in scans.iter().enumerate() {
             for (a, model_from_a) in &scans[..i] {
@@ -145,5 +160,22 @@ mod tests {
         let (first, second) = (&scans[0].0, &scans[1].0);
         let bare = Scan::new(PreparedScan { fine: None, ..second.prepared.clone() });
         assert_eq!(look_finely(first, &bare, &Pose::identity()), None);
+    }
+    #[test]
+    fn of_the_poses_of_a_pair_those_that_clearly_lose_are_believed_less() {
+        let Hall { scans, turned, .. } = hall(3);
+        let ((a, model_from_a), (b, model_from_b)) = (&scans[0], &scans[2]);
+        let at = |pose: Pose, logit: f64| Hypothesis { a_from_b: pose, evidence: Evidence::default(), logit };
+        let truth = model_from_a.inverse() * *model_from_b;
+        let wrong = model_from_a.inverse() * turned * *model_from_b;
+        let mut both = [at(wrong, 6.0), at(truth, 5.0)];
+        contest(a, b, &mut both);
+        assert!(both[0].logit < both[1].logit && both[1].logit == 5.0, "{both:?}");
+        // Who is alone, or far ahead, has no rival to be compared with.
+        for logits in [vec![6.0], vec![6.0, -4.0]] {
+            let mut alone: Vec<Hypothesis> = logits.iter().map(|logit| at(wrong, *logit)).collect();
+            contest(a, b, &mut alone);
+            assert!(alone.iter().zip(&logits).all(|(after, before)| after.logit == *before));
+        }
     }
 }
