@@ -55,7 +55,7 @@ impl Edge {
     }
 }
 
-/// `ln(1 + e^x)`: log-odds x without what speaks against.
+/// `ln(1 + e^x)`: about the log-odds x where they are positive, and never below zero.
 #[must_use]
 pub fn softplus(x: f64) -> f64 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()

@@ -2,9 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
+use super::candidates::LEAST_WORD;
 use super::component::Component;
 use crate::cloud::ScanKey;
 
+/// Fewer scans are no piece: one that hangs on by a pair misplaces nothing but itself.
+const PIECE: usize = 2;
 /// Support below this is none.
 const NO_SUPPORT: f64 = 1e-6;
 
@@ -40,6 +43,33 @@ pub fn loose_side(
     let (side, cut) = weakest_cut(weight, groups)?;
     let side: BTreeSet<ScanKey> = side.into_iter().map(|i| keys[i]).collect();
     (cut < least).then(|| smaller_side(component, side))
+}
+
+/// The smaller of two pieces that one pair of less than `least` support alone holds together, the rest of what lies between them saying
+/// nothing; of several, those of the weakest. `None` if there are none.
+#[must_use]
+pub fn bridge(
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    least: f64,
+) -> Option<BTreeSet<ScanKey>> {
+    let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
+    let index = |scan: &ScanKey| keys.binary_search(scan).ok();
+    let mut links: Vec<(usize, usize, f64)> = supports
+        .iter()
+        .filter(|(_, support)| **support >= LEAST_WORD)
+        .filter_map(|((a, b), support)| Some((index(a)?, index(b)?, *support)))
+        .collect();
+    links.sort_by(|x, y| x.2.total_cmp(&y.2).then((x.0, x.1).cmp(&(y.0, y.1))));
+    let weak = links.iter().take_while(|(_, _, support)| *support < least).enumerate();
+    weak.into_iter().find_map(|(at, &(a, b, _))| {
+        let others = links.iter().enumerate().filter(|(other, _)| *other != at);
+        let groups = tied(keys.len(), others.map(|(_, link)| *link));
+        let [side, other] = [a, b].map(|scan| groups.iter().find(|group| group.contains(&scan)));
+        let (side, other) = (side?, other?);
+        let parts = !side.contains(&b) && side.len() >= PIECE && other.len() >= PIECE;
+        parts.then(|| smaller_side(component, side.iter().map(|scan| keys[*scan]).collect()))
+    })
 }
 
 /// The same cut by the side with fewer scans.
@@ -220,5 +250,24 @@ mod tests {
             side == BTreeSet::from([key(1), key(2), key(3)])
                 || side == BTreeSet::from([key(4), key(5), key(6)])
         );
+    }
+
+    #[test]
+    fn pieces_that_one_weak_pair_holds_together_are_parted_and_no_others() {
+        let component = six();
+        let find = |links: &[(u128, u128, f64)]| {
+            let supports = links.iter().map(|&(a, b, w)| ((ScanKey(a), ScanKey(b)), w)).collect();
+            bridge(&component, &supports, 4.0)
+        };
+        let pieces = [(1, 2, 4.0), (2, 3, 4.0), (1, 3, 2.0), (4, 5, 4.0), (5, 6, 4.0)];
+        let with = |more: &[(u128, u128, f64)]| [&pieces[..], more].concat();
+        let side = Some((1..=3).map(ScanKey).collect());
+        assert_eq!(find(&with(&[(3, 4, 2.5)])), side);
+        // What hardly says anything holds nothing together.
+        assert_eq!(find(&with(&[(3, 4, 2.5), (2, 5, 0.4)])), side);
+        assert_eq!(find(&with(&[(3, 4, 2.5), (2, 5, 1.2)])), None);
+        assert_eq!(find(&with(&[(3, 4, 4.0)])), None);
+        // A scan at the end of a weak pair is no piece.
+        assert_eq!(find(&[(1, 2, 4.0), (2, 3, 4.0), (3, 4, 4.0), (4, 5, 4.0), (5, 6, 2.0)]), None);
     }
 }

@@ -6,8 +6,6 @@ use super::bent_join::bent_join;
 use super::candidates::{CLUSTERS, Candidate, candidates};
 use super::close_look::FEW;
 use super::component::Component;
-use super::consistency::supports;
-use super::cuts::loose_side;
 use super::guarded::{guarded, refined};
 use super::initial_pair::initial_pairs;
 use super::join::{Refusal, weigh_join};
@@ -18,8 +16,7 @@ use super::refine::{Reach, dense, local_bundle_adjustment, neighborhood};
 use super::refusals::{Link, Refusals, Refused, more_telling};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
-use crate::graph::{Retrieval, ScanGraph};
-use crate::pairwise::PairKey;
+use crate::graph::ScanGraph;
 
 /// A waiting scan that could be registered.
 struct NextScan {
@@ -40,7 +37,7 @@ pub struct Mapper {
     /// Scans in no component, and why as far as known.
     pub waiting: BTreeMap<ScanKey, Option<Refusal>>,
     /// Joins that were refused on sight of the surfaces: not worth another look until the support or the surfaces change.
-    refused: Refusals,
+    pub(super) refused: Refusals,
     /// How often each scan was filtered out, so that filtering ends.
     pub(super) filtered: BTreeMap<ScanKey, usize>,
     /// Joins since the whole model was refined last.
@@ -271,33 +268,6 @@ impl Mapper {
         Ok(false)
     }
 
-    /// Pairs worth a try for scans and components that stay apart: for every scan outside the largest component, its most similar
-    /// scans elsewhere that were not tried yet. Those that are far down the list are never worth it, however often it is asked: two buildings
-    /// that will never meet are not compared scan by scan.
-    pub fn widen(
-        &self,
-        graph: &ScanGraph,
-        options: &MappingOptions,
-        control: Control<'_>,
-    ) -> Result<BTreeSet<PairKey>, Cancelled> {
-        let largest =
-            (0..self.components.len()).max_by_key(|i| (self.components[*i].len(), std::cmp::Reverse(*i)));
-        let home = |scan: &ScanKey| self.components.iter().position(|c| c.poses.contains_key(scan));
-        let outside =
-            graph.scans().map(|s| s.key()).filter(|scan| home(scan).is_none() || home(scan) != largest);
-        let promising = options.retrieved * (options.widening_rounds + 1);
-        let mut pairs = BTreeSet::new();
-        for (scan, others) in Retrieval::new(graph).ranked(outside, control)? {
-            let own = home(&scan);
-            let fresh =
-                others.into_iter().take(promising).map(|(other, _)| other).filter(|other| {
-                    (own.is_none() || home(other) != own) && graph.edge(scan, *other).is_none()
-                });
-            pairs.extend(fresh.take(options.retrieved).map(|other| PairKey::of(scan, other)));
-        }
-        Ok(pairs)
-    }
-
     /// Refines every component, then its tracks at the new poses.
     pub fn refine(
         &mut self,
@@ -313,40 +283,6 @@ impl Mapper {
         self.joins_since_refinement = 0;
         // Surfaces lie elsewhere now, and what was bent may be straight.
         self.refused.clear();
-        Ok(())
-    }
-
-    /// Takes apart what hangs together by less than `least` support, so that it is decided anew with all evidence there is now.
-    /// What was joined leniently when little was known cannot poison the rest.
-    pub fn loosen(
-        &mut self,
-        graph: &ScanGraph,
-        least: f64,
-        options: &MappingOptions,
-        control: Control<'_>,
-    ) -> Result<(), Cancelled> {
-        let mut pending = std::mem::take(&mut self.components);
-        while let Some(mut component) = pending.pop() {
-            control.check()?;
-            let supports = supports(graph, &component, options);
-            match loose_side(&component, &supports, least) {
-                Some(side) => {
-                    pending.extend(component.split_off(&side, options));
-                    pending.push(component);
-                }
-                None => self.components.push(component),
-            }
-        }
-        self.refused.clear();
-        self.filtered.clear();
-        self.doubted.clear();
-        self.undone.clear();
-        for refusal in self.waiting.values_mut() {
-            // What was taken back then is no verdict on what is decided now.
-            *refusal = refusal.filter(|refusal| !matches!(refusal, Refusal::Contradicted { .. }));
-        }
-        self.dissolve_small();
-        self.sort_components();
         Ok(())
     }
 

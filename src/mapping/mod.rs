@@ -7,13 +7,13 @@
 //! and joint dense adjustment; `track_refinement` moves keypoints; `mapper` has one method a step and `policy` their order.
 
 mod bent_join;
-mod bridges;
 mod candidates;
 mod close_look;
 mod component;
 mod consistency;
 mod cuts;
 mod decision;
+mod denial;
 mod filter;
 mod gravity;
 mod guarded;
@@ -26,6 +26,7 @@ mod mapper;
 mod next_scan;
 mod open_join;
 mod options;
+mod parting;
 mod policy;
 mod refine;
 mod refusals;
@@ -40,6 +41,7 @@ mod undecided;
 mod undo;
 mod voice;
 mod waiting_reason;
+mod widening;
 
 pub use decision::{Decision, Decisions, Verdict};
 pub use join::Refusal;

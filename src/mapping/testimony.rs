@@ -2,7 +2,7 @@
 //! voice.
 
 use super::component::Component;
-use super::hearing::is_believable;
+use super::hearing::{Verdict, hear};
 use super::options::MappingOptions;
 use super::voice::{Voice, Word, loudest, one_voice};
 use crate::cloud::ScanKey;
@@ -50,12 +50,14 @@ pub struct Testimony {
     pub contradictions: Vec<Contradiction>,
     /// Of these, what most say alike.
     pub voice: Voice,
+    /// What a hearing found of that, if there was one that did not refute it.
+    pub verdict: Option<Verdict>,
 }
 
 impl Testimony {
     /// Asks the pairs that contradict again, with a second look, if several speak with the voice that weighs most. A pair whose scans fit
     /// clearly better where they are than where it would have them is no witness. What is still said with so much weight that the component
-    /// could not stand is given a hearing, voice by voice, and ignored where it is not believable of any of the scans.
+    /// could not stand is given a hearing, voice by voice, and ignored where it is refuted.
     pub fn cross_examine(
         &mut self,
         graph: &ScanGraph,
@@ -81,10 +83,12 @@ impl Testimony {
             }
             let words = Word::both_ways(graph, component, &self.contradictions, options);
             let voice = loudest(&words, options.rival_angle);
-            if is_believable(graph, component, &voice, options, control)? {
+            let verdict = hear(graph, component, &voice, options, control)?;
+            if verdict != Verdict::Refuted {
+                self.verdict = Some(verdict);
                 break;
             }
-            self.contradictions.retain(|c| voice.iter().all(|word| word.pair() != c.pair));
+            self.contradictions.retain(|c| voice.iter().all(|word| word.pair != c.pair));
             self.listen(graph, component, options);
         }
         Ok(())
@@ -186,6 +190,7 @@ mod tests {
             agreeing: 100,
             contradictions: contradictions.clone(),
             voice: Voice { pairs, evidence },
+            verdict: None,
         };
         assert!(!voiced(1, 4.0).condemns());
         assert!(voiced(3, 11.0).condemns());

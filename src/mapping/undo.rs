@@ -1,7 +1,8 @@
-//! Taking back what later evidence contradicts. Where the pairs that speak against a component all speak against one join in it, or its
-//! sides turn out to stand in each other's free space, that join is undone and its pose is not tried again; where they are too many for
-//! that, and say the same, alike places were folded onto each other: nothing there can be told from its twin, so nothing is kept, and the
-//! scans wait until a new scan or a decision changes what is known.
+//! Taking back what later evidence contradicts. Where the pairs that speak against a component all speak against one join in it, or some of its
+//! scans fit the rest clearly better elsewhere, or its sides turn out to stand in each other's free space, that join is undone and its pose is
+//! not tried again; where they are too many for that, and say the same, or where pairs deny what all others make of them, alike places were folded
+//! onto each other: nothing there can be told from its twin, so nothing is kept, and the scans wait until a new scan or a decision changes what
+//! is known.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,6 +11,8 @@ use super::component::Component;
 use super::consistency::supports;
 use super::cuts::{separating_cut, smaller_side};
 use super::decision::{Decision, between_own_frames};
+use super::denial::denied;
+use super::hearing::Verdict;
 use super::intrusion::{Intrusion, intrusion};
 use super::join::Refusal;
 use super::mapper::Mapper;
@@ -40,6 +43,8 @@ enum Finding {
     Folded { strongest: Contradiction },
     /// One join in it is wrong: that of this side.
     Torn { side: BTreeSet<ScanKey>, strongest: Contradiction },
+    /// It is open where these few scans belong.
+    Open { scans: BTreeSet<ScanKey>, strongest: Contradiction },
 }
 
 impl Mapper {
@@ -52,9 +57,13 @@ impl Mapper {
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<Option<Vec<Decision>>, Cancelled> {
-        let mut pending = std::mem::take(&mut self.components);
+        let mut pending: Vec<(usize, Component)> =
+            std::mem::take(&mut self.components).into_iter().enumerate().collect();
+        let mut sound: Vec<(usize, Component)> = Vec::new();
+        // Components of which a part turned out to be folded, with what was said of it.
+        let mut folded: BTreeMap<usize, Testimony> = BTreeMap::new();
         let mut bans = None;
-        while let Some(mut component) = pending.pop() {
+        while let Some((origin, mut component)) = pending.pop() {
             control.check()?;
             // Where a client joined scans, the client has the last word.
             let holds = |scan| component.poses.contains_key(&scan);
@@ -67,22 +76,35 @@ impl Mapper {
             let mut testimony = testimony(graph, &asked, options);
             testimony.cross_examine(graph, &asked, options, control)?;
             match finding(graph, &component, &supports, &testimony, voxel, options, control)? {
-                Finding::Sound => self.components.push(component),
+                Finding::Sound => sound.push((origin, component)),
                 Finding::Folded { strongest } => {
-                    self.undone.push(record(
-                        &supports,
-                        component.poses.keys().copied().collect(),
-                        &strongest,
-                    ));
-                    self.doubt(component, &testimony);
                     bans.get_or_insert_with(Vec::new);
+                    let scans = component.poses.keys().copied().collect();
+                    self.undone.push(record(&supports, scans, &strongest));
+                    self.doubt(component, &testimony);
+                    folded.insert(origin, testimony);
                 }
                 Finding::Torn { side, strongest } => {
                     bans.get_or_insert_with(Vec::new).extend(ban(graph, &component, &supports, &side));
                     self.undone.push(record(&supports, side.iter().copied().collect(), &strongest));
-                    pending.extend(component.split_off(&side, options));
-                    pending.push(component);
+                    pending.extend(component.split_off(&side, options).map(|part| (origin, part)));
+                    pending.push((origin, component));
                 }
+                Finding::Open { scans, strongest } => {
+                    bans.get_or_insert_with(Vec::new);
+                    self.undone.push(record(&supports, scans.iter().copied().collect(), &strongest));
+                    if let Some(few) = component.split_off(&scans, options) {
+                        self.doubt(few, &testimony);
+                    }
+                    pending.push((origin, component));
+                }
+            }
+        }
+        // What a folded component came apart into is of the same alike places.
+        for (origin, component) in sound {
+            match folded.get(&origin) {
+                Some(testimony) => self.doubt(component, testimony),
+                None => self.components.push(component),
             }
         }
         graph.forget_fine();
@@ -112,11 +134,36 @@ fn finding(
     control: Control<'_>,
 ) -> Result<Finding, Cancelled> {
     let tear = |share: f64| tear(graph, component, supports, testimony, share, options);
+    let condemned = testimony.contradictions.first().copied().filter(|_| testimony.condemns());
+    // Who waits already need not be taken out.
+    let moved = match &testimony.verdict {
+        Some(Verdict::Moves { scans, clearly }) => {
+            condemned.zip(part_of(component, scans)).map(|(strongest, side)| {
+                (*clearly, Finding::Torn { side: smaller_side(component, side), strongest })
+            })
+        }
+        _ => None,
+    };
+    if let Some((true, torn)) = moved {
+        return Ok(torn);
+    }
+    if let Some(strongest) = denied(graph, component, options) {
+        return Ok(Finding::Folded { strongest });
+    }
+    if let Some((_, torn)) = moved {
+        return Ok(torn);
+    }
     if let Some((side, strongest)) = tear(OVERWHELMING_SHARE) {
         return Ok(Finding::Torn { side, strongest });
     }
-    if let Some(strongest) = testimony.contradictions.first().filter(|_| testimony.condemns()) {
-        return Ok(Finding::Folded { strongest: *strongest });
+    match (condemned, &testimony.verdict) {
+        (Some(strongest), Some(Verdict::Open(scans))) => {
+            if let Some(scans) = part_of(component, scans) {
+                return Ok(Finding::Open { scans, strongest });
+            }
+        }
+        (None, _) | (_, Some(Verdict::Moves { .. })) => {}
+        (Some(strongest), _) => return Ok(Finding::Folded { strongest }),
     }
     if let Some((side, strongest)) = tear(AGAINST_SHARE) {
         return Ok(Finding::Torn { side, strongest });
@@ -132,6 +179,13 @@ fn finding(
         }
         None => Finding::Sound,
     })
+}
+
+/// Those of the scans that the component holds, if they are some and not all of its.
+fn part_of(component: &Component, scans: &BTreeSet<ScanKey>) -> Option<BTreeSet<ScanKey>> {
+    let held: BTreeSet<ScanKey> =
+        scans.iter().filter(|scan| component.poses.contains_key(scan)).copied().collect();
+    (!held.is_empty() && held.len() < component.len()).then_some(held)
 }
 
 /// Where a component comes apart: a cut between two contradicting scans that what speaks against it with one voice outweighs by this share

@@ -17,9 +17,9 @@ use crate::pairwise::{PairKey, centred_difference};
 #[derive(Debug, Clone, Copy)]
 pub struct Word {
     /// The pair that says it.
-    pair: PairKey,
+    pub pair: PairKey,
     /// Which of its scans would move.
-    moves: ScanKey,
+    pub moves: ScanKey,
     /// From where the scan is to where it would be, in the frame of the component.
     pub motion: Pose,
     /// Centroid of the scan, metres, in the frame of the component.
@@ -85,18 +85,6 @@ impl Word {
     ) -> Vec<Self> {
         let ways = contradictions.iter().flat_map(|c| [(c, c.pair.a), (c, c.pair.b)]);
         ways.filter_map(|(c, moves)| Self::new(graph, component, c, moves, options)).collect()
-    }
-
-    /// The pair that says it.
-    #[must_use]
-    pub fn pair(&self) -> PairKey {
-        self.pair
-    }
-
-    /// The scan that would move.
-    #[must_use]
-    pub fn moves(&self) -> ScanKey {
-        self.moves
     }
 
     /// The scan of the pair that would stay.

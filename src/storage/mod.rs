@@ -41,6 +41,7 @@ mod store;
 #[cfg(test)]
 pub(crate) mod testing;
 mod thinning;
+mod turns;
 mod upload_files;
 mod uploads;
 mod versions;

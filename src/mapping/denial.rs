@@ -1,0 +1,189 @@
+//! Pairs that deny a component. Two scans of a component share much of what they see, so they were matched, and found by themselves that this
+//! pose is wrong: one stands in what the other saw to be empty, by far more than either does elsewhere. Third scans talked them down. Where a
+//! single scan is a little off that happens; where pairs without a scan in common are denied, those third scans took alike places for one:
+//! identical rooms differ by a box on the floor, and the ends of a corridor are not where its other scans see floor. Used by `undo`.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::component::Component;
+use super::options::MappingOptions;
+use super::testimony::Contradiction;
+use crate::cloud::ScanKey;
+use crate::graph::{Edge, ScanGraph};
+use crate::pairwise::{Hypothesis, centred_difference};
+
+/// A pair denies its pose when its own log-odds for it are below this, without the word of third scans, …
+const DENIES: f64 = -1.0;
+/// … although this share of its points coincides: with less, log-odds are low because there is little to see.
+const MUCH: f64 = 0.3;
+/// It lies in free space by this many times the share that is usual for either scan …
+const CONTRAST: f64 = 4.0;
+/// … and this share more.
+const FLOOR: f64 = 0.002;
+/// A pair with log-odds above this shows what is usual for its scans.
+const SURE: f64 = 2.0;
+/// Sure pairs that a scan must have for anything to be usual.
+const LEAST_SURE: usize = 3;
+/// Alike places were taken for one when so many pairs deny it of which no two have a scan in common, …
+const DENIED_PAIRS: usize = 2;
+/// … and of all pairs that share as much, this share does. Of scans that are where they belong up to 0.003 do, by all these limits.
+const DENIED_SHARE: f64 = 0.01;
+
+/// A pair as it stands in the component.
+struct Seen {
+    contradiction: Contradiction,
+    logit: f64,
+    overlap: f64,
+    violation: f64,
+}
+
+/// The surest of the pairs that deny a component, if they show that alike places were taken for one. Pairs that a client decided about are not
+/// asked.
+#[must_use]
+pub fn denied(graph: &ScanGraph, component: &Component, options: &MappingOptions) -> Option<Contradiction> {
+    let mut seen: Vec<Seen> = Vec::new();
+    for a in component.poses.keys() {
+        for b in graph.neighbors(*a).filter(|b| b > a) {
+            let asked = graph.edge(*a, b).filter(|edge| !options.decisions.concern(edge.pair));
+            seen.extend(asked.and_then(|edge| as_it_stands(graph, component, edge, options)));
+        }
+    }
+    let usual = usual(&seen);
+    let shares_much = |pair: &&Seen| pair.overlap >= MUCH;
+    let denies = |pair: &&Seen| {
+        let scans = [pair.contradiction.pair.a, pair.contradiction.pair.b];
+        let usual = scans.map(|scan| usual.get(&scan).copied());
+        let [Some(x), Some(y)] = usual else { return false };
+        pair.logit < DENIES && pair.violation > CONTRAST * x.max(y) + FLOOR
+    };
+    let mut denying: Vec<&Seen> = seen.iter().filter(shares_much).filter(denies).collect();
+    denying.sort_by(|x, y| x.logit.total_cmp(&y.logit).then(x.contradiction.pair.cmp(&y.contradiction.pair)));
+    let enough = denying.len() as f64 >= DENIED_SHARE * seen.iter().filter(shares_much).count() as f64;
+    (enough && apart(&denying) >= DENIED_PAIRS).then(|| denying[0].contradiction)
+}
+
+/// What a pair found of the pose that it has in the component. `None` if it did not look at that pose, or not at free space.
+fn as_it_stands(
+    graph: &ScanGraph,
+    component: &Component,
+    edge: &Edge,
+    options: &MappingOptions,
+) -> Option<Seen> {
+    let (model_from_a, model_from_b) =
+        (component.poses.get(&edge.pair.a)?, component.poses.get(&edge.pair.b)?);
+    let b = graph.scan(edge.pair.b)?;
+    let now = model_from_a.inverse() * *model_from_b;
+    let reach = options.rival_voxels * b.prepared.resolution;
+    let near = |h: &Hypothesis| {
+        let (angle, distance) = centred_difference(&h.a_from_b, &now, &b.centroid);
+        angle < options.rival_angle && distance < reach
+    };
+    let found = edge.hypotheses.iter().map(|h| &h.hypothesis).filter(|h| near(h));
+    let best = found.max_by(|x, y| x.logit.total_cmp(&y.logit)).filter(|h| h.evidence.range_images > 0)?;
+    let counts = best.evidence.both();
+    Some(Seen {
+        contradiction: Contradiction {
+            pair: edge.pair,
+            a_from_b: now,
+            evidence: 0.0,
+            angle: 0.0,
+            distance: 0.0,
+        },
+        logit: best.logit,
+        overlap: counts.overlap(),
+        violation: counts.violation_share(),
+    })
+}
+
+/// By scan, the share of judged points in free space that is usual for it: the median of its sure pairs.
+fn usual(seen: &[Seen]) -> BTreeMap<ScanKey, f64> {
+    let mut shares: BTreeMap<ScanKey, Vec<f64>> = BTreeMap::new();
+    for pair in seen.iter().filter(|pair| pair.logit > SURE) {
+        for scan in [pair.contradiction.pair.a, pair.contradiction.pair.b] {
+            shares.entry(scan).or_default().push(pair.violation);
+        }
+    }
+    shares.retain(|_, shares| shares.len() >= LEAST_SURE);
+    let median = |mut shares: Vec<f64>| {
+        shares.sort_by(f64::total_cmp);
+        shares[shares.len() / 2]
+    };
+    shares.into_iter().map(|(scan, shares)| (scan, median(shares))).collect()
+}
+
+/// How many of the pairs have no scan in common with one before them.
+fn apart(pairs: &[&Seen]) -> usize {
+    let mut met = BTreeSet::new();
+    pairs
+        .iter()
+        .filter(|pair| {
+            let (a, b) = (pair.contradiction.pair.a, pair.contradiction.pair.b);
+            let fresh = !met.contains(&a) && !met.contains(&b);
+            if fresh {
+                met.extend([a, b]);
+            }
+            fresh
+        })
+        .count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose;
+    use crate::mapping::test_hall::Model;
+    use crate::pairwise::{Counts, Evidence, PairKey, PairResult};
+
+    /// Whether the hall is denied when pairs say this of the pose they have: by default they are sure, with little in free space.
+    fn is_denied(said: &[((u128, u128), f64, u32)], inliers: u32) -> bool {
+        let model = Model::new(6);
+        let options = MappingOptions::default();
+        let mut graph = model.graph.clone();
+        let result = |a: u128, b: u128| {
+            let (logit, violations) = said
+                .iter()
+                .find(|(pair, ..)| *pair == (a, b))
+                .map_or((8.0, 2), |(_, logit, violations)| (*logit, *violations));
+            let counts = Counts { points: 1000, inliers, violations, ..Counts::default() };
+            let evidence =
+                Evidence { b_on_a: counts, a_on_b: counts, range_images: 2, ..Evidence::default() };
+            let a_from_b = model.contradiction((a, b), true).a_from_b;
+            PairResult {
+                pair: PairKey::of(ScanKey(a), ScanKey(b)),
+                matches: Vec::new(),
+                hypotheses: vec![Hypothesis { a_from_b, evidence, logit }],
+            }
+        };
+        let pairs = (1..=6).flat_map(|a| (a + 1..=6).map(move |b| (a, b)));
+        graph.add_results(pairs.map(|(a, b)| result(a, b)), &options.support);
+        denied(&graph, &model.component, &options).is_some()
+    }
+
+    #[test]
+    fn pairs_without_a_scan_in_common_deny_a_component_and_one_scan_that_is_off_does_not() {
+        let no = |pair| (pair, -3.0, 40);
+        assert!(!is_denied(&[], 600));
+        assert!(is_denied(&[no((1, 2)), no((3, 4))], 600));
+        assert!(!is_denied(&[no((1, 2)), no((1, 3)), no((1, 4))], 600), "scan 1 is off");
+        assert!(!is_denied(&[no((1, 2))], 600), "one pair may err");
+    }
+
+    #[test]
+    fn who_sees_little_or_nothing_in_free_space_denies_nothing() {
+        assert!(!is_denied(&[((1, 2), -3.0, 8), ((3, 4), -3.0, 8)], 600), "that is usual");
+        assert!(!is_denied(&[((1, 2), 3.0, 40), ((3, 4), 3.0, 40)], 600), "they are sure all the same");
+        assert!(!is_denied(&[((1, 2), -3.0, 40), ((3, 4), -3.0, 40)], 200), "they share little");
+    }
+
+    #[test]
+    fn a_pose_that_a_pair_did_not_look_at_is_not_denied() {
+        let model = Model::new(4);
+        let options = MappingOptions::default();
+        let mut moved = model.component.clone();
+        for scan in [1, 3] {
+            let pose = moved.poses.get_mut(&ScanKey(scan)).expect("a scan of the hall");
+            *pose = Pose::from_translation(nalgebra::Vector3::x() * 30.0) * *pose;
+        }
+        assert_eq!(denied(&model.graph, &moved, &options), None);
+    }
+}

@@ -1,0 +1,79 @@
+//! Components that are parted: what hangs together by little, to be decided anew, and pieces that one weak pair alone holds together. Such pieces
+//! are not joined on one pair; but scan by scan, each on a pair of its own, a component can grow across one all the same, and if that pair is
+//! wrong, so is all behind it. Used by `live_model` and `policy`.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::component::Component;
+use super::consistency::supports;
+use super::cuts::{bridge, loose_side};
+use super::join::Refusal;
+use super::mapper::Mapper;
+use super::options::MappingOptions;
+use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
+use crate::graph::ScanGraph;
+
+/// What pairs of a component's scans say for their poses.
+type Supports = BTreeMap<(ScanKey, ScanKey), f64>;
+
+impl Mapper {
+    /// Takes apart what hangs together by less than `least` support, so that it is decided anew with all evidence there is now.
+    /// What was joined leniently when little was known cannot poison the rest.
+    pub fn loosen(
+        &mut self,
+        graph: &ScanGraph,
+        least: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<(), Cancelled> {
+        self.part(graph, options, control, |component, supports| loose_side(component, supports, least))?;
+        self.refused.clear();
+        self.filtered.clear();
+        self.doubted.clear();
+        self.undone.clear();
+        for refusal in self.waiting.values_mut() {
+            // What was taken back then is no verdict on what is decided now.
+            *refusal = refusal.filter(|refusal| !matches!(refusal, Refusal::Contradicted { .. }));
+        }
+        self.dissolve_small();
+        self.sort_components();
+        Ok(())
+    }
+
+    /// Parts components at their bridges that are not firm.
+    pub fn part_at_bridges(
+        &mut self,
+        graph: &ScanGraph,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<(), Cancelled> {
+        self.part(graph, options, control, |component, supports| {
+            bridge(component, supports, options.firm_support)
+        })?;
+        self.sort_components();
+        Ok(())
+    }
+
+    /// Splits a side off every component, and off what is left, while there is one.
+    fn part(
+        &mut self,
+        graph: &ScanGraph,
+        options: &MappingOptions,
+        control: Control<'_>,
+        side: impl Fn(&Component, &Supports) -> Option<BTreeSet<ScanKey>>,
+    ) -> Result<(), Cancelled> {
+        let mut pending = std::mem::take(&mut self.components);
+        while let Some(mut component) = pending.pop() {
+            control.check()?;
+            match side(&component, &supports(graph, &component, options)) {
+                Some(side) => {
+                    pending.extend(component.split_off(&side, options));
+                    pending.push(component);
+                }
+                None => self.components.push(component),
+            }
+        }
+        Ok(())
+    }
+}
