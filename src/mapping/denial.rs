@@ -1,7 +1,8 @@
-//! Pairs that deny a component. Two scans of a component share much of what they see, so they were matched, and found by themselves that this
-//! pose is wrong: one stands in what the other saw to be empty, by far more than either does elsewhere. Third scans talked them down. Where a
-//! single scan is a little off that happens; where pairs without a scan in common are denied, those third scans took alike places for one:
-//! identical rooms differ by a box on the floor, and the ends of a corridor are not where its other scans see floor. Used by `undo`.
+//! Pairs that deny a component. Two scans of a component share much of what they see, and their surfaces lie well on each other; and yet they found
+//! by themselves that this pose is wrong: one stands in what the other saw to be empty, by far more than either does elsewhere. Third scans
+//! talked them down. Where a scan is a little off, or bent, surfaces do not lie so well; where they do, and pairs without a scan in common
+//! are denied, those third scans took alike places for one: identical rooms differ by a box on the floor, and the ends of a corridor are not
+//! where its other scans see floor. Used by `undo`.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,7 +16,13 @@ use crate::pairwise::{Hypothesis, centred_difference};
 /// A pair denies its pose when its own log-odds for it are below this, without the word of third scans, …
 const DENIES: f64 = -1.0;
 /// … although this share of its points coincides: with less, log-odds are low because there is little to see.
-const MUCH: f64 = 0.3;
+const MUCH: f64 = 0.4;
+/// What it looked at is where its scans are, within this angle …
+const SAME_ANGLE: f64 = 2.0 * std::f64::consts::PI / 180.0;
+/// … and so many voxels, …
+const SAME_VOXELS: f64 = 3.0;
+/// … and where surfaces meet, their distance is below this, root mean square, in voxels. Of scans that are bent it is more.
+const MOST_APART: f64 = 0.4;
 /// It lies in free space by this many times the share that is usual for either scan …
 const CONTRAST: f64 = 4.0;
 /// … and this share more.
@@ -35,6 +42,7 @@ struct Seen {
     logit: f64,
     overlap: f64,
     violation: f64,
+    fits_well: bool,
 }
 
 /// The surest of the pairs that deny a component, if they show that alike places were taken for one. Pairs that a client decided about are not
@@ -45,7 +53,7 @@ pub fn denied(graph: &ScanGraph, component: &Component, options: &MappingOptions
     for a in component.poses.keys() {
         for b in graph.neighbors(*a).filter(|b| b > a) {
             let asked = graph.edge(*a, b).filter(|edge| !options.decisions.concern(edge.pair));
-            seen.extend(asked.and_then(|edge| as_it_stands(graph, component, edge, options)));
+            seen.extend(asked.and_then(|edge| as_it_stands(graph, component, edge)));
         }
     }
     let usual = usual(&seen);
@@ -54,7 +62,7 @@ pub fn denied(graph: &ScanGraph, component: &Component, options: &MappingOptions
         let scans = [pair.contradiction.pair.a, pair.contradiction.pair.b];
         let usual = scans.map(|scan| usual.get(&scan).copied());
         let [Some(x), Some(y)] = usual else { return false };
-        pair.logit < DENIES && pair.violation > CONTRAST * x.max(y) + FLOOR
+        pair.fits_well && pair.logit < DENIES && pair.violation > CONTRAST * x.max(y) + FLOOR
     };
     let mut denying: Vec<&Seen> = seen.iter().filter(shares_much).filter(denies).collect();
     denying.sort_by(|x, y| x.logit.total_cmp(&y.logit).then(x.contradiction.pair.cmp(&y.contradiction.pair)));
@@ -63,24 +71,20 @@ pub fn denied(graph: &ScanGraph, component: &Component, options: &MappingOptions
 }
 
 /// What a pair found of the pose that it has in the component. `None` if it did not look at that pose, or not at free space.
-fn as_it_stands(
-    graph: &ScanGraph,
-    component: &Component,
-    edge: &Edge,
-    options: &MappingOptions,
-) -> Option<Seen> {
+fn as_it_stands(graph: &ScanGraph, component: &Component, edge: &Edge) -> Option<Seen> {
     let (model_from_a, model_from_b) =
         (component.poses.get(&edge.pair.a)?, component.poses.get(&edge.pair.b)?);
     let b = graph.scan(edge.pair.b)?;
     let now = model_from_a.inverse() * *model_from_b;
-    let reach = options.rival_voxels * b.prepared.resolution;
+    let voxel = b.prepared.resolution;
     let near = |h: &Hypothesis| {
         let (angle, distance) = centred_difference(&h.a_from_b, &now, &b.centroid);
-        angle < options.rival_angle && distance < reach
+        angle < SAME_ANGLE && distance < SAME_VOXELS * voxel
     };
     let found = edge.hypotheses.iter().map(|h| &h.hypothesis).filter(|h| near(h));
     let best = found.max_by(|x, y| x.logit.total_cmp(&y.logit)).filter(|h| h.evidence.range_images > 0)?;
     let counts = best.evidence.both();
+    let apart = (f64::from(counts.plane_square) / f64::from(counts.inliers.max(1))).sqrt();
     Some(Seen {
         contradiction: Contradiction {
             pair: edge.pair,
@@ -92,6 +96,7 @@ fn as_it_stands(
         logit: best.logit,
         overlap: counts.overlap(),
         violation: counts.violation_share(),
+        fits_well: apart < MOST_APART * voxel,
     })
 }
 
@@ -135,7 +140,7 @@ mod tests {
     use crate::pairwise::{Counts, Evidence, PairKey, PairResult};
 
     /// Whether the hall is denied when pairs say this of the pose they have: by default they are sure, with little in free space.
-    fn is_denied(said: &[((u128, u128), f64, u32)], inliers: u32) -> bool {
+    fn is_denied(said: &[((u128, u128), f64, u32)], inliers: u32, apart_voxels: f32) -> bool {
         let model = Model::new(6);
         let options = MappingOptions::default();
         let mut graph = model.graph.clone();
@@ -144,7 +149,9 @@ mod tests {
                 .iter()
                 .find(|(pair, ..)| *pair == (a, b))
                 .map_or((8.0, 2), |(_, logit, violations)| (*logit, *violations));
-            let counts = Counts { points: 1000, inliers, violations, ..Counts::default() };
+            let apart = apart_voxels * model.hall.resolution as f32;
+            let plane_square = inliers as f32 * apart * apart;
+            let counts = Counts { points: 1000, inliers, violations, plane_square, ..Counts::default() };
             let evidence =
                 Evidence { b_on_a: counts, a_on_b: counts, range_images: 2, ..Evidence::default() };
             let a_from_b = model.contradiction((a, b), true).a_from_b;
@@ -162,17 +169,19 @@ mod tests {
     #[test]
     fn pairs_without_a_scan_in_common_deny_a_component_and_one_scan_that_is_off_does_not() {
         let no = |pair| (pair, -3.0, 40);
-        assert!(!is_denied(&[], 600));
-        assert!(is_denied(&[no((1, 2)), no((3, 4))], 600));
-        assert!(!is_denied(&[no((1, 2)), no((1, 3)), no((1, 4))], 600), "scan 1 is off");
-        assert!(!is_denied(&[no((1, 2))], 600), "one pair may err");
+        assert!(!is_denied(&[], 600, 0.1));
+        assert!(is_denied(&[no((1, 2)), no((3, 4))], 600, 0.1));
+        assert!(!is_denied(&[no((1, 2)), no((1, 3)), no((1, 4))], 600, 0.1), "scan 1 is off");
+        assert!(!is_denied(&[no((1, 2))], 600, 0.1), "one pair may err");
     }
 
     #[test]
     fn who_sees_little_or_nothing_in_free_space_denies_nothing() {
-        assert!(!is_denied(&[((1, 2), -3.0, 8), ((3, 4), -3.0, 8)], 600), "that is usual");
-        assert!(!is_denied(&[((1, 2), 3.0, 40), ((3, 4), 3.0, 40)], 600), "they are sure all the same");
-        assert!(!is_denied(&[((1, 2), -3.0, 40), ((3, 4), -3.0, 40)], 200), "they share little");
+        assert!(!is_denied(&[((1, 2), -3.0, 8), ((3, 4), -3.0, 8)], 600, 0.1), "that is usual");
+        assert!(!is_denied(&[((1, 2), 3.0, 40), ((3, 4), 3.0, 40)], 600, 0.1), "they are sure all the same");
+        let no = [((1, 2), -3.0, 40), ((3, 4), -3.0, 40)];
+        assert!(!is_denied(&no, 200, 0.1), "they share little");
+        assert!(!is_denied(&no, 600, 0.6), "they are bent");
     }
 
     #[test]

@@ -12,7 +12,7 @@ use super::consistency::supports;
 use super::cuts::{separating_cut, smaller_side};
 use super::decision::{Decision, between_own_frames};
 use super::denial::denied;
-use super::hearing::Verdict;
+use super::hearing::{Verdict, hear};
 use super::intrusion::{Intrusion, intrusion};
 use super::join::Refusal;
 use super::mapper::Mapper;
@@ -20,7 +20,7 @@ use super::open_join::Undone;
 use super::options::MappingOptions;
 use super::testimony::{Contradiction, Testimony, testimony};
 use super::undecided::{Undecided, undecided};
-use super::voice::{Word, one_voice};
+use super::voice::{Word, loudest, one_voice};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::ScanGraph;
@@ -133,7 +133,7 @@ fn finding(
     options: &MappingOptions,
     control: Control<'_>,
 ) -> Result<Finding, Cancelled> {
-    let tear = |share: f64| tear(graph, component, supports, testimony, share, options);
+    let tear = |share: f64| tear(graph, component, supports, testimony, share, options, control);
     let condemned = testimony.contradictions.first().copied().filter(|_| testimony.condemns());
     // Who waits already need not be taken out.
     let moved = match &testimony.verdict {
@@ -153,7 +153,7 @@ fn finding(
     if let Some((_, torn)) = moved {
         return Ok(torn);
     }
-    if let Some((side, strongest)) = tear(OVERWHELMING_SHARE) {
+    if let Some((side, strongest)) = tear(OVERWHELMING_SHARE)? {
         return Ok(Finding::Torn { side, strongest });
     }
     match (condemned, &testimony.verdict) {
@@ -165,7 +165,7 @@ fn finding(
         (None, _) | (_, Some(Verdict::Moves { .. })) => {}
         (Some(strongest), _) => return Ok(Finding::Folded { strongest }),
     }
-    if let Some((side, strongest)) = tear(AGAINST_SHARE) {
+    if let Some((side, strongest)) = tear(AGAINST_SHARE)? {
         return Ok(Finding::Torn { side, strongest });
     }
     match undecided(graph, component, testimony, voxel, options, control)? {
@@ -189,7 +189,7 @@ fn part_of(component: &Component, scans: &BTreeSet<ScanKey>) -> Option<BTreeSet<
 }
 
 /// Where a component comes apart: a cut between two contradicting scans that what speaks against it with one voice outweighs by this share
-/// of its support, by its smaller side, and the pair that shows it.
+/// of its support, unless a hearing refutes that voice; by its smaller side, and the pair that shows it.
 fn tear(
     graph: &ScanGraph,
     component: &Component,
@@ -197,17 +197,29 @@ fn tear(
     testimony: &Testimony,
     share: f64,
     options: &MappingOptions,
-) -> Option<(BTreeSet<ScanKey>, Contradiction)> {
+    control: Control<'_>,
+) -> Result<Option<(BTreeSet<ScanKey>, Contradiction)>, Cancelled> {
     let inside: Vec<&Contradiction> = testimony.inside(component).collect();
+    let mut refuted: BTreeSet<BTreeSet<ScanKey>> = BTreeSet::new();
     for strongest in inside.iter().take(TRIED) {
-        let (side, support) = separating_cut(component, supports, strongest.pair.a, strongest.pair.b)?;
+        let Some((side, support)) = separating_cut(component, supports, strongest.pair.a, strongest.pair.b)
+        else {
+            break;
+        };
+        if refuted.contains(&side) {
+            continue;
+        }
         let words = Word::on_side(graph, component, &side, &inside, options);
         let against = one_voice(&words, options.rival_angle);
         if against.pairs >= AGAINST_PAIRS && against.evidence >= share * support {
-            return Some((smaller_side(component, side), **strongest));
+            let voice = loudest(&words, options.rival_angle);
+            if hear(graph, component, &voice, options, control)? != Verdict::Refuted {
+                return Ok(Some((smaller_side(component, side), **strongest)));
+            }
+            refuted.insert(side);
         }
     }
-    None
+    Ok(None)
 }
 
 /// Forbids the pose that a join had, by its strongest edge.
