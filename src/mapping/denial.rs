@@ -1,10 +1,10 @@
-//! Pairs that deny a component. Two scans of a component share much of what they see, and their surfaces lie well on each other; and yet they found
-//! by themselves that this pose is wrong: one stands in what the other saw to be empty, by far more than either does elsewhere. Third scans
-//! talked them down. Where a scan is a little off, or bent, surfaces do not lie so well; where they do, and pairs without a scan in common
-//! are denied, those third scans took alike places for one: identical rooms differ by a box on the floor, and the ends of a corridor are not
-//! where its other scans see floor. Used by `undo`.
+//! Pairs that deny a component. Two scans of a component share much of what they see, and their surfaces lie well on each other; and yet one stands
+//! in what the other saw to be empty, by far more than either does elsewhere, so that by themselves they are not sure. Third scans talked them
+//! down. Where a scan is a little off, or bent, surfaces do not lie so well; and where one scan saw what is gone, it is in all such pairs. Where
+//! surfaces lie well and no single scan is to blame, those third scans took alike places for one: identical rooms differ by a box on the
+//! floor, and the ends of a corridor are not where its other scans see floor. Used by `undo`.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use super::component::Component;
 use super::options::MappingOptions;
@@ -13,27 +13,30 @@ use crate::cloud::ScanKey;
 use crate::graph::{Edge, ScanGraph};
 use crate::pairwise::{Hypothesis, centred_difference};
 
-/// A pair denies its pose when its own log-odds for it are below this, without the word of third scans, …
-const DENIES: f64 = -1.0;
-/// … although this share of its points coincides: with less, log-odds are low because there is little to see.
-const MUCH: f64 = 0.4;
+/// A pair denies its pose when its own log-odds for it are below this, without the word of third scans: where so much coincides they are higher, …
+const DENIES: f64 = 6.0;
+/// … although this share of its points coincides, and as large a share as their distance is in voxels, root mean square: with less, log-odds are
+/// low because there is little to see.
+const MUCH: f64 = 0.3;
 /// What it looked at is where its scans are, within this angle …
 const SAME_ANGLE: f64 = 2.0 * std::f64::consts::PI / 180.0;
 /// … and so many voxels, …
 const SAME_VOXELS: f64 = 3.0;
-/// … and where surfaces meet, their distance is below this, root mean square, in voxels. Of scans that are bent it is more.
+/// … and that distance is below this. Of scans that are bent it is more.
 const MOST_APART: f64 = 0.4;
 /// It lies in free space by this many times the share that is usual for either scan …
 const CONTRAST: f64 = 4.0;
 /// … and this share more.
-const FLOOR: f64 = 0.002;
+const FLOOR: f64 = 0.006;
 /// A pair with log-odds above this shows what is usual for its scans.
 const SURE: f64 = 2.0;
 /// Sure pairs that a scan must have for anything to be usual.
 const LEAST_SURE: usize = 3;
-/// Alike places were taken for one when so many pairs deny it of which no two have a scan in common, …
+/// The share of a scan's sure pairs that show less than what is usual: in identical rooms most of its pairs may be wrong.
+const USUAL: f64 = 0.25;
+/// Alike places were taken for one when pairs without a scan that is in all of them deny it, …
 const DENIED_PAIRS: usize = 2;
-/// … and of all pairs that share as much, this share does. Of scans that are where they belong up to 0.003 do, by all these limits.
+/// … and of all pairs that share as much, this share does. Of scans that are where they belong hardly any pair does.
 const DENIED_SHARE: f64 = 0.01;
 
 /// A pair as it stands in the component.
@@ -67,7 +70,7 @@ pub fn denied(graph: &ScanGraph, component: &Component, options: &MappingOptions
     let mut denying: Vec<&Seen> = seen.iter().filter(shares_much).filter(denies).collect();
     denying.sort_by(|x, y| x.logit.total_cmp(&y.logit).then(x.contradiction.pair.cmp(&y.contradiction.pair)));
     let enough = denying.len() as f64 >= DENIED_SHARE * seen.iter().filter(shares_much).count() as f64;
-    (enough && apart(&denying) >= DENIED_PAIRS).then(|| denying[0].contradiction)
+    (enough && denying.len() >= DENIED_PAIRS && nobody_is_in_all(&denying)).then(|| denying[0].contradiction)
 }
 
 /// What a pair found of the pose that it has in the component. `None` if it did not look at that pose, or not at free space.
@@ -96,11 +99,11 @@ fn as_it_stands(graph: &ScanGraph, component: &Component, edge: &Edge) -> Option
         logit: best.logit,
         overlap: counts.overlap(),
         violation: counts.violation_share(),
-        fits_well: apart < MOST_APART * voxel,
+        fits_well: apart < MOST_APART.min(counts.overlap()) * voxel,
     })
 }
 
-/// By scan, the share of judged points in free space that is usual for it: the median of its sure pairs.
+/// By scan, the share of judged points in free space that is usual for it, by its sure pairs.
 fn usual(seen: &[Seen]) -> BTreeMap<ScanKey, f64> {
     let mut shares: BTreeMap<ScanKey, Vec<f64>> = BTreeMap::new();
     for pair in seen.iter().filter(|pair| pair.logit > SURE) {
@@ -109,27 +112,18 @@ fn usual(seen: &[Seen]) -> BTreeMap<ScanKey, f64> {
         }
     }
     shares.retain(|_, shares| shares.len() >= LEAST_SURE);
-    let median = |mut shares: Vec<f64>| {
+    let usual = |mut shares: Vec<f64>| {
         shares.sort_by(f64::total_cmp);
-        shares[shares.len() / 2]
+        shares[(shares.len() as f64 * USUAL) as usize]
     };
-    shares.into_iter().map(|(scan, shares)| (scan, median(shares))).collect()
+    shares.into_iter().map(|(scan, shares)| (scan, usual(shares))).collect()
 }
 
-/// How many of the pairs have no scan in common with one before them.
-fn apart(pairs: &[&Seen]) -> usize {
-    let mut met = BTreeSet::new();
-    pairs
-        .iter()
-        .filter(|pair| {
-            let (a, b) = (pair.contradiction.pair.a, pair.contradiction.pair.b);
-            let fresh = !met.contains(&a) && !met.contains(&b);
-            if fresh {
-                met.extend([a, b]);
-            }
-            fresh
-        })
-        .count()
+/// Whether no scan is in all of the pairs.
+fn nobody_is_in_all(pairs: &[&Seen]) -> bool {
+    let scans = |seen: &Seen| [seen.contradiction.pair.a, seen.contradiction.pair.b];
+    let Some(first) = pairs.first() else { return true };
+    scans(first).iter().all(|scan| pairs.iter().any(|pair| !scans(pair).contains(scan)))
 }
 
 #[cfg(test)]
@@ -167,10 +161,11 @@ mod tests {
     }
 
     #[test]
-    fn pairs_without_a_scan_in_common_deny_a_component_and_one_scan_that_is_off_does_not() {
+    fn pairs_of_different_scans_deny_a_component_and_one_scan_that_is_off_does_not() {
         let no = |pair| (pair, -3.0, 40);
         assert!(!is_denied(&[], 600, 0.1));
         assert!(is_denied(&[no((1, 2)), no((3, 4))], 600, 0.1));
+        assert!(is_denied(&[no((1, 2)), no((2, 3)), no((1, 3))], 600, 0.1), "either of three may be off");
         assert!(!is_denied(&[no((1, 2)), no((1, 3)), no((1, 4))], 600, 0.1), "scan 1 is off");
         assert!(!is_denied(&[no((1, 2))], 600, 0.1), "one pair may err");
     }
@@ -178,7 +173,7 @@ mod tests {
     #[test]
     fn who_sees_little_or_nothing_in_free_space_denies_nothing() {
         assert!(!is_denied(&[((1, 2), -3.0, 8), ((3, 4), -3.0, 8)], 600, 0.1), "that is usual");
-        assert!(!is_denied(&[((1, 2), 3.0, 40), ((3, 4), 3.0, 40)], 600, 0.1), "they are sure all the same");
+        assert!(!is_denied(&[((1, 2), 7.0, 40), ((3, 4), 7.0, 40)], 600, 0.1), "they are sure all the same");
         let no = [((1, 2), -3.0, 40), ((3, 4), -3.0, 40)];
         assert!(!is_denied(&no, 200, 0.1), "they share little");
         assert!(!is_denied(&no, 600, 0.6), "they are bent");

@@ -1,6 +1,8 @@
 //! What pairs say by themselves of where their scans are in a component: which are sure of another pose, and whether they say it with one
 //! voice.
 
+use std::collections::BTreeSet;
+
 use super::component::Component;
 use super::hearing::{Verdict, hear};
 use super::options::MappingOptions;
@@ -57,11 +59,12 @@ pub struct Testimony {
 impl Testimony {
     /// Asks the pairs that contradict again, with a second look, if several speak with the voice that weighs most. A pair whose scans fit
     /// clearly better where they are than where it would have them is no witness. What is still said with so much weight that the component
-    /// could not stand is given a hearing, voice by voice, and ignored where it is refuted.
+    /// could not stand is given a hearing, voice by voice, and ignored where it is refuted. Of the component's scans, `waits` only stand in it.
     pub fn cross_examine(
         &mut self,
         graph: &ScanGraph,
         component: &Component,
+        waits: &BTreeSet<ScanKey>,
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
@@ -83,7 +86,7 @@ impl Testimony {
             }
             let words = Word::both_ways(graph, component, &self.contradictions, options);
             let voice = loudest(&words, options.rival_angle);
-            let verdict = hear(graph, component, &voice, options, control)?;
+            let verdict = hear(graph, component, &voice, waits, options, control)?;
             if verdict != Verdict::Refuted {
                 self.verdict = Some(verdict);
                 break;

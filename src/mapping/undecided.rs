@@ -8,9 +8,11 @@ use std::collections::BTreeSet;
 use super::candidates::{CLUSTERS, candidates};
 use super::component::Component;
 use super::cuts::smaller_side;
+use super::hearing::{Verdict, hear};
 use super::join::{Refusal, weigh_join};
 use super::options::{JoinLevel, MappingOptions};
 use super::testimony::{CLEARLY_DIFFERENT, Contradiction, Testimony};
+use super::voice::Word;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
@@ -36,7 +38,8 @@ pub struct Undecided {
     pub rivals: bool,
 }
 
-/// The first of the component's doubtful cuts, the most doubtful first, whose two sides a join would not put together as they are. `voxel`
+/// The first of the component's doubtful cuts, the most doubtful first, whose two sides a join would not put together as they are, unless a hearing
+/// refutes the pair that led to it. `voxel`
 /// in metres.
 pub fn undecided(
     graph: &ScanGraph,
@@ -63,11 +66,29 @@ pub fn undecided(
     cuts.sort_by(|x, y| x.0.total_cmp(&y.0).then_with(|| x.1.cmp(&y.1)));
     for (_, side, strongest) in cuts {
         control.check()?;
-        if let Some(rivals) = reweigh(graph, component, &side, voxel, options, control).transpose()? {
+        if let Some(rivals) = reweigh(graph, component, &side, voxel, options, control).transpose()?
+            && !is_refuted(graph, component, &strongest, options, control)?
+        {
             return Ok(Some(Undecided { side: smaller_side(component, side), strongest, rivals }));
         }
     }
     Ok(None)
+}
+
+/// Whether a hearing refutes what a pair says, whichever of its scans would move.
+fn is_refuted(
+    graph: &ScanGraph,
+    component: &Component,
+    contradiction: &Contradiction,
+    options: &MappingOptions,
+    control: Control<'_>,
+) -> Result<bool, Cancelled> {
+    for word in Word::both_ways(graph, component, &[*contradiction], options) {
+        if hear(graph, component, &[&word], &BTreeSet::new(), options, control)? != Verdict::Refuted {
+            return Ok(false);
+        }
+    }
+    Ok(true)
 }
 
 /// Joins the two sides anew: true if rivals forbid it, false if another pose is better, `None` if it is what it was.

@@ -23,6 +23,7 @@ use super::undecided::{Undecided, undecided};
 use super::voice::{Word, loudest, one_voice};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
+use crate::geometry::Pose;
 use crate::graph::ScanGraph;
 
 /// A join is undone when what pairs with one voice say against it comes to this share of its support …
@@ -74,7 +75,8 @@ impl Mapper {
             let supports = supports(graph, &component, options);
             let asked = self.with_torn(graph, &component, voxel, options);
             let mut testimony = testimony(graph, &asked, options);
-            testimony.cross_examine(graph, &asked, options, control)?;
+            let waits = asked.poses.keys().copied().filter(|scan| !holds(*scan)).collect();
+            testimony.cross_examine(graph, &asked, &waits, options, control)?;
             match finding(graph, &component, &supports, &testimony, voxel, options, control)? {
                 Finding::Sound => sound.push((origin, component)),
                 Finding::Folded { strongest } => {
@@ -137,21 +139,23 @@ fn finding(
     let condemned = testimony.contradictions.first().copied().filter(|_| testimony.condemns());
     // Who waits already need not be taken out.
     let moved = match &testimony.verdict {
-        Some(Verdict::Moves { scans, clearly }) => {
-            condemned.zip(part_of(component, scans)).map(|(strongest, side)| {
-                (*clearly, Finding::Torn { side: smaller_side(component, side), strongest })
-            })
-        }
+        Some(Verdict::Moves { scans, motion, clearly }) => condemned
+            .zip(part_of(component, scans))
+            .map(|(strongest, side)| Moved { side, motion: *motion, clearly: *clearly, strongest }),
         _ => None,
     };
-    if let Some((true, torn)) = moved {
-        return Ok(torn);
+    if let Some(moved) = &moved
+        && moved.clearly
+    {
+        return Ok(moved.torn(component));
     }
     if let Some(strongest) = denied(graph, component, options) {
         return Ok(Finding::Folded { strongest });
     }
-    if let Some((_, torn)) = moved {
-        return Ok(torn);
+    if let Some(moved) = moved {
+        let settled = moved.settles(graph, component, options, control)?;
+        let strongest = moved.strongest;
+        return Ok(if settled { moved.torn(component) } else { Finding::Folded { strongest } });
     }
     if let Some((side, strongest)) = tear(OVERWHELMING_SHARE)? {
         return Ok(Finding::Torn { side, strongest });
@@ -179,6 +183,41 @@ fn finding(
         }
         None => Finding::Sound,
     })
+}
+
+/// Scans of a component that fit the rest better elsewhere.
+struct Moved {
+    side: BTreeSet<ScanKey>,
+    /// In the frame of the component.
+    motion: Pose,
+    clearly: bool,
+    strongest: Contradiction,
+}
+
+impl Moved {
+    fn torn(&self, component: &Component) -> Finding {
+        Finding::Torn { side: smaller_side(component, self.side.clone()), strongest: self.strongest }
+    }
+
+    /// Whether nothing that a hearing does not refute would be said against the component any more if they were there. Where there are more
+    /// alike places than two, one move does not put them right.
+    fn settles(
+        &self,
+        graph: &ScanGraph,
+        component: &Component,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<bool, Cancelled> {
+        let mut there = component.clone();
+        for (scan, pose) in &mut there.poses {
+            if self.side.contains(scan) {
+                *pose = self.motion * *pose;
+            }
+        }
+        let mut testimony = testimony(graph, &there, options);
+        testimony.cross_examine(graph, &there, &BTreeSet::new(), options, control)?;
+        Ok(!testimony.condemns())
+    }
 }
 
 /// Those of the scans that the component holds, if they are some and not all of its.
@@ -213,7 +252,7 @@ fn tear(
         let against = one_voice(&words, options.rival_angle);
         if against.pairs >= AGAINST_PAIRS && against.evidence >= share * support {
             let voice = loudest(&words, options.rival_angle);
-            if hear(graph, component, &voice, options, control)? != Verdict::Refuted {
+            if hear(graph, component, &voice, &BTreeSet::new(), options, control)? != Verdict::Refuted {
                 return Ok(Some((smaller_side(component, side), **strongest)));
             }
             refuted.insert(side);
