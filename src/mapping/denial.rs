@@ -1,6 +1,6 @@
 //! Pairs that deny a component. Two scans of a component share much of what they see, and their surfaces lie well on each other; and yet one stands
-//! in what the other saw to be empty, by far more than either does elsewhere, so that by themselves they are not sure. Third scans talked them
-//! down. Where a scan is a little off, or bent, surfaces do not lie so well; and where one scan saw what is gone, it is in all such pairs. Where
+//! in what the other saw to be empty, by far more than either does elsewhere, so that by themselves they are less sure than pairs that share as
+//! much. Third scans talked them down. Where a scan is a little off, or bent, surfaces do not lie so well; and where one scan saw what is gone, it is in all such pairs. Where
 //! surfaces lie well and no single scan is to blame, those third scans took alike places for one: identical rooms differ by a box on the
 //! floor, and the ends of a corridor are not where its other scans see floor. Used by `undo`.
 
@@ -89,13 +89,7 @@ fn as_it_stands(graph: &ScanGraph, component: &Component, edge: &Edge) -> Option
     let counts = best.evidence.both();
     let apart = (f64::from(counts.plane_square) / f64::from(counts.inliers.max(1))).sqrt();
     Some(Seen {
-        contradiction: Contradiction {
-            pair: edge.pair,
-            a_from_b: now,
-            evidence: 0.0,
-            angle: 0.0,
-            distance: 0.0,
-        },
+        contradiction: Contradiction::of_pose(edge.pair, now),
         logit: best.logit,
         overlap: counts.overlap(),
         violation: counts.violation_share(),
@@ -133,10 +127,9 @@ mod tests {
     use crate::mapping::test_hall::Model;
     use crate::pairwise::{Counts, Evidence, PairKey, PairResult};
 
-    /// Whether the hall is denied when pairs say this of the pose they have: by default they are sure, with little in free space.
-    fn is_denied(said: &[((u128, u128), f64, u32)], inliers: u32, apart_voxels: f32) -> bool {
+    /// A hall whose pairs say this of the pose they have, log-odds and points in free space: by default they are sure, with little in free space.
+    fn hall_of(said: &[((u128, u128), f64, u32)], inliers: u32, apart_voxels: f32) -> (Model, ScanGraph) {
         let model = Model::new(6);
-        let options = MappingOptions::default();
         let mut graph = model.graph.clone();
         let result = |a: u128, b: u128| {
             let (logit, violations) = said
@@ -156,8 +149,13 @@ mod tests {
             }
         };
         let pairs = (1..=6).flat_map(|a| (a + 1..=6).map(move |b| (a, b)));
-        graph.add_results(pairs.map(|(a, b)| result(a, b)), &options.support);
-        denied(&graph, &model.component, &options).is_some()
+        graph.add_results(pairs.map(|(a, b)| result(a, b)), &MappingOptions::default().support);
+        (model, graph)
+    }
+
+    fn is_denied(said: &[((u128, u128), f64, u32)], inliers: u32, apart_voxels: f32) -> bool {
+        let (model, graph) = hall_of(said, inliers, apart_voxels);
+        denied(&graph, &model.component, &MappingOptions::default()).is_some()
     }
 
     #[test]
@@ -181,13 +179,15 @@ mod tests {
 
     #[test]
     fn a_pose_that_a_pair_did_not_look_at_is_not_denied() {
-        let model = Model::new(4);
+        let no = [((1, 2), -3.0, 40), ((3, 4), -3.0, 40)];
+        let (model, graph) = hall_of(&no, 600, 0.1);
         let options = MappingOptions::default();
         let mut moved = model.component.clone();
+        assert!(denied(&graph, &moved, &options).is_some());
         for scan in [1, 3] {
             let pose = moved.poses.get_mut(&ScanKey(scan)).expect("a scan of the hall");
             *pose = Pose::from_translation(nalgebra::Vector3::x() * 30.0) * *pose;
         }
-        assert_eq!(denied(&model.graph, &moved, &options), None);
+        assert_eq!(denied(&graph, &moved, &options), None);
     }
 }

@@ -54,7 +54,7 @@ pub fn intrusion(
         let found = violation_of(&judge(graph, &rest, &part, &Pose::identity()));
         let limit = ViolationLimit::new(graph, (&rest, &part), lenient, options);
         if found > LENIENCE * limit.share(support) {
-            let shown_by = Contradiction { pair, a_from_b, evidence: 0.0, angle: 0.0, distance: 0.0 };
+            let shown_by = Contradiction::of_pose(pair, a_from_b);
             return Ok(Some(Intrusion { side, shown_by }));
         }
     }

@@ -44,6 +44,8 @@ pub struct Mapper {
     pub joins_since_refinement: usize,
     /// Scans of components that were taken apart because their pairs contradict each other.
     pub(super) doubted: BTreeSet<ScanKey>,
+    /// Scans of which it is open where they belong: they wait until all is decided anew, and say nothing of the rest.
+    pub(super) set_aside: BTreeSet<ScanKey>,
     /// Placements taken back since the model was last decided anew.
     pub undone: Vec<Undone>,
     /// Joins not made although something speaks for them, as of the end of growing.
@@ -70,6 +72,7 @@ impl Mapper {
         self.waiting.remove(&scan);
         self.filtered.remove(&scan);
         self.doubted.remove(&scan);
+        self.set_aside.remove(&scan);
         self.open_joins.retain(|open| open.a != scan && open.b != scan);
         self.undone.retain(|undone| !undone.scans.contains(&scan) && !undone.evidence.contains(&scan));
         self.refused.forget(scan);
@@ -288,7 +291,8 @@ impl Mapper {
 
     /// Waiting scans that may be joined.
     fn free(&self) -> BTreeSet<ScanKey> {
-        self.waiting.keys().filter(|scan| !self.doubted.contains(scan)).copied().collect()
+        let free = |scan: &&ScanKey| !self.doubted.contains(scan) && !self.set_aside.contains(scan);
+        self.waiting.keys().filter(free).copied().collect()
     }
 
     /// Takes apart the components that hold any of these scans: what was decided about them decides all of it anew.

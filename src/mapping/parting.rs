@@ -31,6 +31,7 @@ impl Mapper {
         self.refused.clear();
         self.filtered.clear();
         self.doubted.clear();
+        self.set_aside.clear();
         self.undone.clear();
         for refusal in self.waiting.values_mut() {
             // What was taken back then is no verdict on what is decided now.

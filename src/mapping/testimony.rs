@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 
 use super::component::Component;
-use super::hearing::{Verdict, hear};
+use super::hearing::{Hearing, Ruling};
 use super::options::MappingOptions;
 use super::voice::{Voice, Word, loudest, one_voice};
 use crate::cloud::ScanKey;
@@ -53,7 +53,15 @@ pub struct Testimony {
     /// Of these, what most say alike.
     pub voice: Voice,
     /// What a hearing found of that, if there was one that did not refute it.
-    pub verdict: Option<Verdict>,
+    pub ruling: Option<Ruling>,
+}
+
+impl Contradiction {
+    /// Of a pair whose pose is wrong, without a word of which is right.
+    #[must_use]
+    pub fn of_pose(pair: PairKey, a_from_b: Pose) -> Self {
+        Self { pair, a_from_b, evidence: 0.0, angle: 0.0, distance: 0.0 }
+    }
 }
 
 impl Testimony {
@@ -80,15 +88,22 @@ impl Testimony {
         }
         self.contradictions = upheld;
         self.listen(graph, component, options);
+        let mut hearing: Option<Hearing<'_>> = None;
         for _ in 0..HEARINGS {
             if !self.condemns() {
                 break;
             }
             let words = Word::both_ways(graph, component, &self.contradictions, options);
             let voice = loudest(&words, options.rival_angle);
-            let verdict = hear(graph, component, &voice, waits, options, control)?;
-            if verdict != Verdict::Refuted {
-                self.verdict = Some(verdict);
+            if hearing.is_none() {
+                hearing = Some(Hearing::open(graph, component, control)?);
+            }
+            let ruling = match &hearing {
+                Some(hearing) => hearing.hear(&voice, waits, options, control)?,
+                None => Ruling::Believable,
+            };
+            if ruling != Ruling::Refuted {
+                self.ruling = Some(ruling);
                 break;
             }
             self.contradictions.retain(|c| voice.iter().all(|word| word.pair != c.pair));
@@ -193,7 +208,7 @@ mod tests {
             agreeing: 100,
             contradictions: contradictions.clone(),
             voice: Voice { pairs, evidence },
-            verdict: None,
+            ruling: None,
         };
         assert!(!voiced(1, 4.0).condemns());
         assert!(voiced(3, 11.0).condemns());

@@ -8,11 +8,11 @@ use std::collections::BTreeSet;
 use super::candidates::{CLUSTERS, candidates};
 use super::component::Component;
 use super::cuts::smaller_side;
-use super::hearing::{Verdict, hear};
+use super::hearing::{Hearing, Ruling};
 use super::join::{Refusal, weigh_join};
 use super::options::{JoinLevel, MappingOptions};
 use super::testimony::{CLEARLY_DIFFERENT, Contradiction, Testimony};
-use super::voice::Word;
+use super::voice::{Word, loudest};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
@@ -39,7 +39,7 @@ pub struct Undecided {
 }
 
 /// The first of the component's doubtful cuts, the most doubtful first, whose two sides a join would not put together as they are, unless a hearing
-/// refutes the pair that led to it. `voxel`
+/// refutes what pairs across say alike. `voxel`
 /// in metres.
 pub fn undecided(
     graph: &ScanGraph,
@@ -64,31 +64,26 @@ pub fn undecided(
         }
     }
     cuts.sort_by(|x, y| x.0.total_cmp(&y.0).then_with(|| x.1.cmp(&y.1)));
+    let inside: Vec<&Contradiction> = testimony.inside(component).collect();
+    let mut hearing: Option<Hearing<'_>> = None;
     for (_, side, strongest) in cuts {
         control.check()?;
-        if let Some(rivals) = reweigh(graph, component, &side, voxel, options, control).transpose()?
-            && !is_refuted(graph, component, &strongest, options, control)?
-        {
+        if let Some(rivals) = reweigh(graph, component, &side, voxel, options, control).transpose()? {
+            // What most pairs across say alike against the sides is heard like any voice.
+            let words = Word::on_side(graph, component, &side, &inside, options);
+            let voice = loudest(&words, options.rival_angle);
+            if !voice.is_empty() && hearing.is_none() {
+                hearing = Some(Hearing::open(graph, component, control)?);
+            }
+            if let Some(hearing) = hearing.as_ref().filter(|_| !voice.is_empty())
+                && hearing.hear(&voice, &BTreeSet::new(), options, control)? == Ruling::Refuted
+            {
+                continue;
+            }
             return Ok(Some(Undecided { side: smaller_side(component, side), strongest, rivals }));
         }
     }
     Ok(None)
-}
-
-/// Whether a hearing refutes what a pair says, whichever of its scans would move.
-fn is_refuted(
-    graph: &ScanGraph,
-    component: &Component,
-    contradiction: &Contradiction,
-    options: &MappingOptions,
-    control: Control<'_>,
-) -> Result<bool, Cancelled> {
-    for word in Word::both_ways(graph, component, &[*contradiction], options) {
-        if hear(graph, component, &[&word], &BTreeSet::new(), options, control)? != Verdict::Refuted {
-            return Ok(false);
-        }
-    }
-    Ok(true)
 }
 
 /// Joins the two sides anew: true if rivals forbid it, false if another pose is better, `None` if it is what it was.

@@ -12,13 +12,14 @@ use super::consistency::supports;
 use super::cuts::{separating_cut, smaller_side};
 use super::decision::{Decision, between_own_frames};
 use super::denial::denied;
-use super::hearing::{Verdict, hear};
+use super::hearing::{Hearing, Ruling};
 use super::intrusion::{Intrusion, intrusion};
 use super::join::Refusal;
 use super::mapper::Mapper;
 use super::open_join::Undone;
 use super::options::MappingOptions;
 use super::testimony::{Contradiction, Testimony, testimony};
+use super::tracks::Tracks;
 use super::undecided::{Undecided, undecided};
 use super::voice::{Word, loudest, one_voice};
 use crate::cloud::ScanKey;
@@ -61,8 +62,9 @@ impl Mapper {
         let mut pending: Vec<(usize, Component)> =
             std::mem::take(&mut self.components).into_iter().enumerate().collect();
         let mut sound: Vec<(usize, Component)> = Vec::new();
-        // Components of which a part turned out to be folded, with what was said of it.
-        let mut folded: BTreeMap<usize, Testimony> = BTreeMap::new();
+        // Components of which a part turned out to be folded, with what was said of it: what else they came apart into is of the same alike
+        // places.
+        let mut folded: BTreeMap<usize, (Testimony, Contradiction)> = BTreeMap::new();
         let mut bans = None;
         while let Some((origin, mut component)) = pending.pop() {
             control.check()?;
@@ -72,19 +74,24 @@ impl Mapper {
                 self.components.push(component);
                 continue;
             }
+            if folded.contains_key(&origin) {
+                sound.push((origin, component));
+                continue;
+            }
             let supports = supports(graph, &component, options);
             let asked = self.with_torn(graph, &component, voxel, options);
             let mut testimony = testimony(graph, &asked, options);
             let waits = asked.poses.keys().copied().filter(|scan| !holds(*scan)).collect();
             testimony.cross_examine(graph, &asked, &waits, options, control)?;
-            match finding(graph, &component, &supports, &testimony, voxel, options, control)? {
+            let case =
+                Case { graph, component: &component, supports: &supports, testimony: &testimony, options };
+            match case.finding(&asked, &waits, voxel, control)? {
                 Finding::Sound => sound.push((origin, component)),
                 Finding::Folded { strongest } => {
                     bans.get_or_insert_with(Vec::new);
-                    let scans = component.poses.keys().copied().collect();
-                    self.undone.push(record(&supports, scans, &strongest));
+                    self.undone.push(record(&supports, scans_of(&component), &strongest));
                     self.doubt(component, &testimony);
-                    folded.insert(origin, testimony);
+                    folded.insert(origin, (testimony, strongest));
                 }
                 Finding::Torn { side, strongest } => {
                     bans.get_or_insert_with(Vec::new).extend(ban(graph, &component, &supports, &side));
@@ -95,17 +102,22 @@ impl Mapper {
                 Finding::Open { scans, strongest } => {
                     bans.get_or_insert_with(Vec::new);
                     self.undone.push(record(&supports, scans.iter().copied().collect(), &strongest));
-                    if let Some(few) = component.split_off(&scans, options) {
-                        self.doubt(few, &testimony);
+                    let few = component.split_off(&scans, options);
+                    for scan in few.into_iter().flat_map(|few| few.poses.into_keys()) {
+                        self.set_aside.insert(scan);
+                        self.waiting.insert(scan, Some(refusal(&testimony)));
                     }
                     pending.push((origin, component));
                 }
             }
         }
-        // What a folded component came apart into is of the same alike places.
         for (origin, component) in sound {
             match folded.get(&origin) {
-                Some(testimony) => self.doubt(component, testimony),
+                Some((testimony, strongest)) => {
+                    let supports = supports(graph, &component, options);
+                    self.undone.push(record(&supports, scans_of(&component), strongest));
+                    self.doubt(component, testimony);
+                }
                 None => self.components.push(component),
             }
         }
@@ -117,148 +129,166 @@ impl Mapper {
 
     /// Lets the scans of a component wait, and not be joined before all is decided anew.
     fn doubt(&mut self, component: Component, testimony: &Testimony) {
-        let refusal =
-            Refusal::Contradicted { against: testimony.contradictions.len(), agreeing: testimony.agreeing };
         for scan in component.poses.into_keys() {
             self.doubted.insert(scan);
-            self.waiting.insert(scan, Some(refusal));
+            self.waiting.insert(scan, Some(refusal(testimony)));
         }
     }
 }
 
-fn finding(
-    graph: &ScanGraph,
-    component: &Component,
-    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
-    testimony: &Testimony,
-    voxel: f64,
-    options: &MappingOptions,
-    control: Control<'_>,
-) -> Result<Finding, Cancelled> {
-    let tear = |share: f64| tear(graph, component, supports, testimony, share, options, control);
-    let condemned = testimony.contradictions.first().copied().filter(|_| testimony.condemns());
-    // Who waits already need not be taken out.
-    let moved = match &testimony.verdict {
-        Some(Verdict::Moves { scans, motion, clearly }) => condemned
-            .zip(part_of(component, scans))
-            .map(|(strongest, side)| Moved { side, motion: *motion, clearly: *clearly, strongest }),
-        _ => None,
-    };
-    if let Some(moved) = &moved
-        && moved.clearly
-    {
-        return Ok(moved.torn(component));
-    }
-    if let Some(strongest) = denied(graph, component, options) {
-        return Ok(Finding::Folded { strongest });
-    }
-    if let Some(moved) = moved {
-        let settled = moved.settles(graph, component, options, control)?;
-        let strongest = moved.strongest;
-        return Ok(if settled { moved.torn(component) } else { Finding::Folded { strongest } });
-    }
-    if let Some((side, strongest)) = tear(OVERWHELMING_SHARE)? {
-        return Ok(Finding::Torn { side, strongest });
-    }
-    match (condemned, &testimony.verdict) {
-        (Some(strongest), Some(Verdict::Open(scans))) => {
-            if let Some(scans) = part_of(component, scans) {
-                return Ok(Finding::Open { scans, strongest });
+fn refusal(testimony: &Testimony) -> Refusal {
+    Refusal::Contradicted { against: testimony.contradictions.len(), agreeing: testimony.agreeing }
+}
+
+fn scans_of(component: &Component) -> Vec<ScanKey> {
+    component.poses.keys().copied().collect()
+}
+
+/// A component, and what is said of it.
+struct Case<'c> {
+    graph: &'c ScanGraph,
+    component: &'c Component,
+    supports: &'c BTreeMap<(ScanKey, ScanKey), f64>,
+    testimony: &'c Testimony,
+    options: &'c MappingOptions,
+}
+
+impl Case<'_> {
+    /// What is to be done. Of `asked`, the component with some scans that wait, `waits` are these.
+    fn finding(
+        &self,
+        asked: &Component,
+        waits: &BTreeSet<ScanKey>,
+        voxel: f64,
+        control: Control<'_>,
+    ) -> Result<Finding, Cancelled> {
+        let Self { graph, component, supports, testimony, options } = *self;
+        let condemned = testimony.contradictions.first().copied().filter(|_| testimony.condemns());
+        let moved = match &testimony.ruling {
+            Some(Ruling::Moves { scans, motion, clearly }) => condemned
+                .zip(self.part(scans))
+                .map(|(strongest, side)| (strongest, side, scans, motion, *clearly)),
+            _ => None,
+        };
+        if let Some((_, side, _, _, true)) = &moved {
+            return Ok(self.torn(side.clone()));
+        }
+        if let Some(strongest) = denied(graph, component, options) {
+            return Ok(Finding::Folded { strongest });
+        }
+        if let Some((strongest, side, scans, motion, _)) = moved {
+            let settled = self.settles(asked, scans, motion, waits, control)?;
+            return Ok(if settled { self.torn(side) } else { Finding::Folded { strongest } });
+        }
+        if let Some((side, strongest)) = self.tear(OVERWHELMING_SHARE, control)? {
+            return Ok(Finding::Torn { side, strongest });
+        }
+        if let Some(strongest) = condemned {
+            let few = match &testimony.ruling {
+                Some(Ruling::Open(scans)) => self.part(scans),
+                _ => None,
+            };
+            return Ok(match few {
+                Some(scans) => Finding::Open { strongest: self.shown_by(&scans).unwrap_or(strongest), scans },
+                None => Finding::Folded { strongest },
+            });
+        }
+        if let Some((side, strongest)) = self.tear(AGAINST_SHARE, control)? {
+            return Ok(Finding::Torn { side, strongest });
+        }
+        match undecided(graph, component, testimony, voxel, options, control)? {
+            Some(Undecided { strongest, rivals: true, .. }) => return Ok(Finding::Folded { strongest }),
+            Some(Undecided { side, strongest, .. }) => return Ok(Finding::Torn { side, strongest }),
+            None => {}
+        }
+        Ok(match intrusion(graph, component, supports, options, control)? {
+            Some(Intrusion { side, shown_by }) => {
+                Finding::Torn { side: smaller_side(component, side), strongest: shown_by }
             }
+            None => Finding::Sound,
+        })
+    }
+
+    /// Those of the scans that the component holds, if they are some and not all of its.
+    fn part(&self, scans: &BTreeSet<ScanKey>) -> Option<BTreeSet<ScanKey>> {
+        let held: BTreeSet<ScanKey> =
+            scans.iter().filter(|scan| self.component.poses.contains_key(scan)).copied().collect();
+        (!held.is_empty() && held.len() < self.component.len()).then_some(held)
+    }
+
+    /// The surest of the pairs that contradict the component and are of this side and the rest.
+    fn shown_by(&self, side: &BTreeSet<ScanKey>) -> Option<Contradiction> {
+        let across = |c: &&Contradiction| side.contains(&c.pair.a) != side.contains(&c.pair.b);
+        self.testimony.inside(self.component).find(across).copied()
+    }
+
+    /// A side that belongs elsewhere.
+    fn torn(&self, side: BTreeSet<ScanKey>) -> Finding {
+        match self.shown_by(&side).or_else(|| self.testimony.contradictions.first().copied()) {
+            Some(strongest) => Finding::Torn { side: smaller_side(self.component, side), strongest },
+            None => Finding::Sound,
         }
-        (None, _) | (_, Some(Verdict::Moves { .. })) => {}
-        (Some(strongest), _) => return Ok(Finding::Folded { strongest }),
-    }
-    if let Some((side, strongest)) = tear(AGAINST_SHARE)? {
-        return Ok(Finding::Torn { side, strongest });
-    }
-    match undecided(graph, component, testimony, voxel, options, control)? {
-        Some(Undecided { strongest, rivals: true, .. }) => return Ok(Finding::Folded { strongest }),
-        Some(Undecided { side, strongest, .. }) => return Ok(Finding::Torn { side, strongest }),
-        None => {}
-    }
-    Ok(match intrusion(graph, component, supports, options, control)? {
-        Some(Intrusion { side, shown_by }) => {
-            Finding::Torn { side: smaller_side(component, side), strongest: shown_by }
-        }
-        None => Finding::Sound,
-    })
-}
-
-/// Scans of a component that fit the rest better elsewhere.
-struct Moved {
-    side: BTreeSet<ScanKey>,
-    /// In the frame of the component.
-    motion: Pose,
-    clearly: bool,
-    strongest: Contradiction,
-}
-
-impl Moved {
-    fn torn(&self, component: &Component) -> Finding {
-        Finding::Torn { side: smaller_side(component, self.side.clone()), strongest: self.strongest }
     }
 
-    /// Whether nothing that a hearing does not refute would be said against the component any more if they were there. Where there are more
-    /// alike places than two, one move does not put them right.
+    /// Whether nothing that a hearing does not refute would be said any more if these scans were moved. Where there are more alike places
+    /// than two, one move does not put them right.
     fn settles(
         &self,
-        graph: &ScanGraph,
-        component: &Component,
-        options: &MappingOptions,
+        asked: &Component,
+        scans: &BTreeSet<ScanKey>,
+        motion: &Pose,
+        waits: &BTreeSet<ScanKey>,
         control: Control<'_>,
     ) -> Result<bool, Cancelled> {
-        let mut there = component.clone();
-        for (scan, pose) in &mut there.poses {
-            if self.side.contains(scan) {
-                *pose = self.motion * *pose;
-            }
-        }
-        let mut testimony = testimony(graph, &there, options);
-        testimony.cross_examine(graph, &there, &BTreeSet::new(), options, control)?;
+        let moved = |(scan, pose): (&ScanKey, &Pose)| {
+            (*scan, if scans.contains(scan) { *motion * *pose } else { *pose })
+        };
+        let poses = asked.poses.iter().map(moved).collect();
+        let there = Component { gauge: asked.gauge, poses, tracks: Tracks::default() };
+        let mut testimony = testimony(self.graph, &there, self.options);
+        testimony.cross_examine(self.graph, &there, waits, self.options, control)?;
         Ok(!testimony.condemns())
     }
-}
 
-/// Those of the scans that the component holds, if they are some and not all of its.
-fn part_of(component: &Component, scans: &BTreeSet<ScanKey>) -> Option<BTreeSet<ScanKey>> {
-    let held: BTreeSet<ScanKey> =
-        scans.iter().filter(|scan| component.poses.contains_key(scan)).copied().collect();
-    (!held.is_empty() && held.len() < component.len()).then_some(held)
-}
-
-/// Where a component comes apart: a cut between two contradicting scans that what speaks against it with one voice outweighs by this share
-/// of its support, unless a hearing refutes that voice; by its smaller side, and the pair that shows it.
-fn tear(
-    graph: &ScanGraph,
-    component: &Component,
-    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
-    testimony: &Testimony,
-    share: f64,
-    options: &MappingOptions,
-    control: Control<'_>,
-) -> Result<Option<(BTreeSet<ScanKey>, Contradiction)>, Cancelled> {
-    let inside: Vec<&Contradiction> = testimony.inside(component).collect();
-    let mut refuted: BTreeSet<BTreeSet<ScanKey>> = BTreeSet::new();
-    for strongest in inside.iter().take(TRIED) {
-        let Some((side, support)) = separating_cut(component, supports, strongest.pair.a, strongest.pair.b)
-        else {
-            break;
-        };
-        if refuted.contains(&side) {
-            continue;
-        }
-        let words = Word::on_side(graph, component, &side, &inside, options);
-        let against = one_voice(&words, options.rival_angle);
-        if against.pairs >= AGAINST_PAIRS && against.evidence >= share * support {
-            let voice = loudest(&words, options.rival_angle);
-            if hear(graph, component, &voice, &BTreeSet::new(), options, control)? != Verdict::Refuted {
-                return Ok(Some((smaller_side(component, side), **strongest)));
+    /// Where the component comes apart: a cut between two contradicting scans that what speaks against it with one voice outweighs by this share
+    /// of its support, unless a hearing refutes that voice; by its smaller side, and the pair that shows it.
+    fn tear(
+        &self,
+        share: f64,
+        control: Control<'_>,
+    ) -> Result<Option<(BTreeSet<ScanKey>, Contradiction)>, Cancelled> {
+        let Self { graph, component, supports, testimony, options } = *self;
+        let inside: Vec<&Contradiction> = testimony.inside(component).collect();
+        let mut hearing: Option<Hearing<'_>> = None;
+        let mut refuted: BTreeSet<BTreeSet<ScanKey>> = BTreeSet::new();
+        for strongest in inside.iter().take(TRIED) {
+            let Some((side, support)) =
+                separating_cut(component, supports, strongest.pair.a, strongest.pair.b)
+            else {
+                break;
+            };
+            if refuted.contains(&side) {
+                continue;
             }
-            refuted.insert(side);
+            let words = Word::on_side(graph, component, &side, &inside, options);
+            let against = one_voice(&words, options.rival_angle);
+            if against.pairs < AGAINST_PAIRS || against.evidence < share * support {
+                continue;
+            }
+            if hearing.is_none() {
+                hearing = Some(Hearing::open(graph, component, control)?);
+            }
+            let voice = loudest(&words, options.rival_angle);
+            if let Some(hearing) = &hearing
+                && hearing.hear(&voice, &BTreeSet::new(), options, control)? == Ruling::Refuted
+            {
+                refuted.insert(side);
+                continue;
+            }
+            return Ok(Some((smaller_side(component, side), **strongest)));
         }
+        Ok(None)
     }
-    Ok(None)
 }
 
 /// Forbids the pose that a join had, by its strongest edge.
@@ -357,6 +387,55 @@ fn firmest_path(supports: &BTreeMap<(ScanKey, ScanKey), f64>, from: ScanKey, to:
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::control::{CancelToken, Silent};
+    use crate::mapping::test_hall::Model;
+
+    #[test]
+    fn a_scan_at_the_wrong_end_of_a_hall_is_taken_out_and_the_others_stay() {
+        let model = Model::new(6);
+        let options = MappingOptions::default();
+        let voxel = model.hall.resolution;
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let undo = |component: Component| {
+            let mut mapper = Mapper { components: vec![component], ..Mapper::default() };
+            let bans = mapper.undo_contradicted(&model.graph, voxel, &options, control);
+            (mapper, bans.expect("nobody cancels"))
+        };
+        let (mapper, bans) = undo(model.with_turned(&[5]));
+        assert_eq!(bans.map(|bans| bans.len()), Some(1));
+        assert_eq!(mapper.components.len(), 1);
+        let left: Vec<ScanKey> = mapper.components[0].poses.keys().copied().collect();
+        assert_eq!(left, [1, 2, 3, 4, 6].map(ScanKey));
+        assert!(mapper.waiting.contains_key(&ScanKey(5)) && mapper.doubted.is_empty());
+        assert_eq!(mapper.undone.len(), 1);
+        let (mapper, bans) = undo(model.component.clone());
+        assert!(bans.is_none() && mapper.components[0].len() == 6 && mapper.undone.is_empty());
+    }
+
+    #[test]
+    fn scans_settle_where_everybody_says_they_belong() {
+        let model = Model::new(6);
+        let options = MappingOptions::default();
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let settles = |component: &Component| {
+            let said = testimony(&model.graph, component, &options);
+            let case = Case {
+                graph: &model.graph,
+                component,
+                supports: &supports(&model.graph, component, &options),
+                testimony: &said,
+                options: &options,
+            };
+            let turned = BTreeSet::from([ScanKey(5)]);
+            case.settles(component, &turned, &model.hall.turned, &BTreeSet::new(), control)
+        };
+        // Half a turn is its own inverse.
+        assert_eq!(settles(&model.with_turned(&[5])), Ok(true));
+        assert_eq!(settles(&model.component), Ok(false));
+        assert_eq!(settles(&model.with_turned(&[4, 5])), Ok(false), "scan 4 is still at the wrong end");
+    }
 
     #[test]
     fn the_proof_goes_around_by_the_firmest_edges() {
