@@ -15,15 +15,17 @@ use crate::pairwise::{Hypothesis, centred_difference};
 
 /// A pair denies its pose when its own log-odds for it are below this, without the word of third scans: where so much coincides they are higher, …
 const DENIES: f64 = 6.0;
-/// … although this share of its points coincides, and as large a share as their distance is in voxels, root mean square: with less, log-odds are
-/// low because there is little to see.
-const MUCH: f64 = 0.3;
+/// … although this share of its points coincides: with less, log-odds are low because there is little to see.
+const MUCH: f64 = 0.32;
 /// What it looked at is where its scans are, within this angle …
 const SAME_ANGLE: f64 = 2.0 * std::f64::consts::PI / 180.0;
 /// … and so many voxels, …
 const SAME_VOXELS: f64 = 3.0;
-/// … and that distance is below this. Of scans that are bent it is more.
+/// … and where surfaces meet, their distance is below this, root mean square, in voxels, …
 const MOST_APART: f64 = 0.4;
+/// … and below the share that coincides by this factor. Of scans that are bent it is more; and what a moving sensor saw around corners stands in
+/// the free space of others, but they share little.
+const TIGHT: f64 = 1.6;
 /// It lies in free space by this many times the share that is usual for either scan …
 const CONTRAST: f64 = 4.0;
 /// … and this share more.
@@ -34,8 +36,8 @@ const SURE: f64 = 2.0;
 const LEAST_SURE: usize = 3;
 /// The share of a scan's sure pairs that show less than what is usual: in identical rooms most of its pairs may be wrong.
 const USUAL: f64 = 0.25;
-/// Alike places were taken for one when pairs without a scan that is in all of them deny it, …
-const DENIED_PAIRS: usize = 2;
+/// Alike places were taken for one when so many pairs deny it, without a scan that is in all of them, …
+const DENIED_PAIRS: usize = 3;
 /// … and of all pairs that share as much, this share does. Of scans that are where they belong hardly any pair does.
 const DENIED_SHARE: f64 = 0.01;
 
@@ -93,7 +95,7 @@ fn as_it_stands(graph: &ScanGraph, component: &Component, edge: &Edge) -> Option
         logit: best.logit,
         overlap: counts.overlap(),
         violation: counts.violation_share(),
-        fits_well: apart < MOST_APART.min(counts.overlap()) * voxel,
+        fits_well: apart < MOST_APART.min(counts.overlap() / TIGHT) * voxel,
     })
 }
 
@@ -162,24 +164,28 @@ mod tests {
     fn pairs_of_different_scans_deny_a_component_and_one_scan_that_is_off_does_not() {
         let no = |pair| (pair, -3.0, 40);
         assert!(!is_denied(&[], 600, 0.1));
-        assert!(is_denied(&[no((1, 2)), no((3, 4))], 600, 0.1));
+        assert!(is_denied(&[no((1, 2)), no((3, 4)), no((5, 6))], 600, 0.1));
         assert!(is_denied(&[no((1, 2)), no((2, 3)), no((1, 3))], 600, 0.1), "either of three may be off");
         assert!(!is_denied(&[no((1, 2)), no((1, 3)), no((1, 4))], 600, 0.1), "scan 1 is off");
-        assert!(!is_denied(&[no((1, 2))], 600, 0.1), "one pair may err");
+        assert!(!is_denied(&[no((1, 2)), no((3, 4))], 600, 0.1), "two pairs may err");
     }
 
     #[test]
     fn who_sees_little_or_nothing_in_free_space_denies_nothing() {
-        assert!(!is_denied(&[((1, 2), -3.0, 8), ((3, 4), -3.0, 8)], 600, 0.1), "that is usual");
-        assert!(!is_denied(&[((1, 2), 7.0, 40), ((3, 4), 7.0, 40)], 600, 0.1), "they are sure all the same");
-        let no = [((1, 2), -3.0, 40), ((3, 4), -3.0, 40)];
+        let all =
+            |logit: f64, violations: u32| [(1, 2), (3, 4), (5, 6)].map(|pair| (pair, logit, violations));
+        assert!(!is_denied(&all(-3.0, 8), 600, 0.1), "that is usual");
+        assert!(!is_denied(&all(7.0, 40), 600, 0.1), "they are sure all the same");
+        let no = all(-3.0, 40);
+        assert!(is_denied(&no, 600, 0.1));
         assert!(!is_denied(&no, 200, 0.1), "they share little");
         assert!(!is_denied(&no, 600, 0.6), "they are bent");
+        assert!(!is_denied(&all(-3.0, 40), 360, 0.3), "they share too little for how well they fit");
     }
 
     #[test]
     fn a_pose_that_a_pair_did_not_look_at_is_not_denied() {
-        let no = [((1, 2), -3.0, 40), ((3, 4), -3.0, 40)];
+        let no = [(1, 2), (3, 4), (5, 6)].map(|pair| (pair, -3.0, 40));
         let (model, graph) = hall_of(&no, 600, 0.1);
         let options = MappingOptions::default();
         let mut moved = model.component.clone();
