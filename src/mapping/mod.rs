@@ -23,6 +23,7 @@ mod intrusion;
 mod join;
 mod live_model;
 mod mapper;
+mod moves;
 mod next_scan;
 mod open_join;
 mod options;
