@@ -15,6 +15,7 @@ mod cuts;
 mod decision;
 mod denial;
 mod filter;
+mod finding;
 mod gravity;
 mod guarded;
 mod hearing;

@@ -1,0 +1,225 @@
+//! What is to be done about a component, given all that speaks against it: what the hearing ruled, pairs that deny it, what outweighs the support of a
+//! join, cuts that would not be joined as they are, and surfaces in free space. Used by `undo`, which does it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::component::Component;
+use super::cuts::{separating_cut, smaller_side};
+use super::denial::denied;
+use super::hearing::{Hearing, Ruling};
+use super::intrusion::{Intrusion, intrusion};
+use super::options::MappingOptions;
+use super::testimony::{Contradiction, Testimony, testimony};
+use super::tracks::Tracks;
+use super::undecided::{Undecided, undecided};
+use super::voice::{Word, loudest, one_voice};
+use crate::cloud::ScanKey;
+use crate::control::{Cancelled, Control};
+use crate::geometry::Pose;
+use crate::graph::ScanGraph;
+
+/// A join is undone when what pairs with one voice say against it comes to this share of its support …
+const AGAINST_SHARE: f64 = 0.5;
+/// … and without asking whether places are alike when it comes to this: of alike places, either has much for it. Where such were folded
+/// onto each other it comes to 1.2 at most.
+const OVERWHELMING_SHARE: f64 = 2.0;
+/// … and at least this many pairs say the same.
+const AGAINST_PAIRS: usize = 2;
+/// Contradictions whose separation is tried, the strongest first.
+const TRIED: usize = 8;
+
+/// What is to be done about a component, given what speaks against it.
+pub enum Finding {
+    /// Nothing.
+    Sound,
+    /// Alike places were taken for one, or nothing tells which of two is right: nothing of it is kept.
+    Folded { strongest: Contradiction },
+    /// One join in it is wrong: that of this side.
+    Torn { side: BTreeSet<ScanKey>, strongest: Contradiction },
+    /// It is open where these few scans belong.
+    Open { scans: BTreeSet<ScanKey>, strongest: Contradiction },
+}
+
+/// A component, and what is said of it.
+pub struct Case<'c> {
+    /// The scan graph.
+    pub graph: &'c ScanGraph,
+    /// The component.
+    pub component: &'c Component,
+    /// What pairs of its scans say for their poses.
+    pub supports: &'c BTreeMap<(ScanKey, ScanKey), f64>,
+    /// What was said of it, after the hearing.
+    pub testimony: &'c Testimony,
+    /// Settings.
+    pub options: &'c MappingOptions,
+}
+
+impl Case<'_> {
+    /// What is to be done. Of `asked`, the component with some scans that wait, `waits` are these.
+    pub fn finding(
+        &self,
+        asked: &Component,
+        waits: &BTreeSet<ScanKey>,
+        voxel: f64,
+        control: Control<'_>,
+    ) -> Result<Finding, Cancelled> {
+        let Self { graph, component, supports, testimony, options } = *self;
+        let condemned = testimony.contradictions.first().copied().filter(|_| testimony.condemns());
+        let moved = match &testimony.ruling {
+            Some(Ruling::Moves { scans, motion, clearly }) => condemned
+                .zip(self.part(scans))
+                .map(|(strongest, side)| (strongest, side, scans, motion, *clearly)),
+            _ => None,
+        };
+        if let Some((_, side, _, _, true)) = &moved {
+            return Ok(self.torn(side.clone()));
+        }
+        if let Some(strongest) = denied(graph, component, options) {
+            return Ok(Finding::Folded { strongest });
+        }
+        if let Some((strongest, side, scans, motion, _)) = moved {
+            let settled = self.settles(asked, scans, motion, waits, control)?;
+            return Ok(if settled { self.torn(side) } else { Finding::Folded { strongest } });
+        }
+        if let Some((side, strongest)) = self.tear(OVERWHELMING_SHARE, control)? {
+            return Ok(Finding::Torn { side, strongest });
+        }
+        if let Some(strongest) = condemned {
+            let few = match &testimony.ruling {
+                Some(Ruling::Open(scans)) => self.part(scans),
+                _ => None,
+            };
+            return Ok(match few {
+                Some(scans) => Finding::Open { strongest: self.shown_by(&scans).unwrap_or(strongest), scans },
+                None => Finding::Folded { strongest },
+            });
+        }
+        if let Some((side, strongest)) = self.tear(AGAINST_SHARE, control)? {
+            return Ok(Finding::Torn { side, strongest });
+        }
+        match undecided(graph, component, testimony, voxel, options, control)? {
+            Some(Undecided { strongest, rivals: true, .. }) => return Ok(Finding::Folded { strongest }),
+            Some(Undecided { side, strongest, .. }) => return Ok(Finding::Torn { side, strongest }),
+            None => {}
+        }
+        Ok(match intrusion(graph, component, supports, options, control)? {
+            Some(Intrusion { side, shown_by }) => {
+                Finding::Torn { side: smaller_side(component, side), strongest: shown_by }
+            }
+            None => Finding::Sound,
+        })
+    }
+
+    /// Those of the scans that the component holds, if they are some and not all of its.
+    fn part(&self, scans: &BTreeSet<ScanKey>) -> Option<BTreeSet<ScanKey>> {
+        let held: BTreeSet<ScanKey> =
+            scans.iter().filter(|scan| self.component.poses.contains_key(scan)).copied().collect();
+        (!held.is_empty() && held.len() < self.component.len()).then_some(held)
+    }
+
+    /// The surest of the pairs that contradict the component and are of this side and the rest.
+    fn shown_by(&self, side: &BTreeSet<ScanKey>) -> Option<Contradiction> {
+        let across = |c: &&Contradiction| side.contains(&c.pair.a) != side.contains(&c.pair.b);
+        self.testimony.inside(self.component).find(across).copied()
+    }
+
+    /// A side that belongs elsewhere.
+    fn torn(&self, side: BTreeSet<ScanKey>) -> Finding {
+        match self.shown_by(&side).or_else(|| self.testimony.contradictions.first().copied()) {
+            Some(strongest) => Finding::Torn { side: smaller_side(self.component, side), strongest },
+            None => Finding::Sound,
+        }
+    }
+
+    /// Whether nothing that a hearing does not refute would be said any more if these scans were moved. Where there are more alike places
+    /// than two, one move does not put them right.
+    fn settles(
+        &self,
+        asked: &Component,
+        scans: &BTreeSet<ScanKey>,
+        motion: &Pose,
+        waits: &BTreeSet<ScanKey>,
+        control: Control<'_>,
+    ) -> Result<bool, Cancelled> {
+        let moved = |(scan, pose): (&ScanKey, &Pose)| {
+            (*scan, if scans.contains(scan) { *motion * *pose } else { *pose })
+        };
+        let poses = asked.poses.iter().map(moved).collect();
+        let there = Component { gauge: asked.gauge, poses, tracks: Tracks::default() };
+        let mut testimony = testimony(self.graph, &there, self.options);
+        testimony.cross_examine(self.graph, &there, waits, self.options, control)?;
+        Ok(!testimony.condemns())
+    }
+
+    /// Where the component comes apart: a cut between two contradicting scans that what speaks against it with one voice outweighs by this share
+    /// of its support, unless a hearing refutes that voice; by its smaller side, and the pair that shows it.
+    fn tear(
+        &self,
+        share: f64,
+        control: Control<'_>,
+    ) -> Result<Option<(BTreeSet<ScanKey>, Contradiction)>, Cancelled> {
+        let Self { graph, component, supports, testimony, options } = *self;
+        let inside: Vec<&Contradiction> = testimony.inside(component).collect();
+        let mut hearing: Option<Hearing<'_>> = None;
+        let mut refuted: BTreeSet<BTreeSet<ScanKey>> = BTreeSet::new();
+        for strongest in inside.iter().take(TRIED) {
+            let Some((side, support)) =
+                separating_cut(component, supports, strongest.pair.a, strongest.pair.b)
+            else {
+                break;
+            };
+            if refuted.contains(&side) {
+                continue;
+            }
+            let words = Word::on_side(graph, component, &side, &inside, options);
+            let against = one_voice(&words, options.rival_angle);
+            if against.pairs < AGAINST_PAIRS || against.evidence < share * support {
+                continue;
+            }
+            if hearing.is_none() {
+                hearing = Some(Hearing::open(graph, component, control)?);
+            }
+            let voice = loudest(&words, options.rival_angle);
+            if let Some(hearing) = &hearing
+                && hearing.hear(&voice, &BTreeSet::new(), options, control)? == Ruling::Refuted
+            {
+                refuted.insert(side);
+                continue;
+            }
+            return Ok(Some((smaller_side(component, side), **strongest)));
+        }
+        Ok(None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::control::{CancelToken, Silent};
+    use crate::mapping::consistency::supports;
+    use crate::mapping::test_hall::Model;
+
+    #[test]
+    fn scans_settle_where_everybody_says_they_belong() {
+        let model = Model::new(6);
+        let options = MappingOptions::default();
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let settles = |component: &Component| {
+            let said = testimony(&model.graph, component, &options);
+            let case = Case {
+                graph: &model.graph,
+                component,
+                supports: &supports(&model.graph, component, &options),
+                testimony: &said,
+                options: &options,
+            };
+            let turned = BTreeSet::from([ScanKey(5)]);
+            case.settles(component, &turned, &model.hall.turned, &BTreeSet::new(), control)
+        };
+        // Half a turn is its own inverse.
+        assert_eq!(settles(&model.with_turned(&[5])), Ok(true));
+        assert_eq!(settles(&model.component), Ok(false));
+        assert_eq!(settles(&model.with_turned(&[4, 5])), Ok(false), "scan 4 is still at the wrong end");
+    }
+}
