@@ -36,6 +36,9 @@ pub struct SimulateArgs {
     /// How much furniture: 0 none, 1 usual, 2 packed
     #[arg(long, default_value_t = 1.0)]
     pub density: f32,
+    /// Share of the furniture that is moved before the second half of the scans is taken, 0 to 1
+    #[arg(long, default_value_t = 0.0)]
+    pub moved: f32,
     /// People who stand around the sensor, elsewhere in every scan
     #[arg(long, default_value_t = 0)]
     pub people: usize,
@@ -84,6 +87,8 @@ pub enum Kind {
     TwinRooms,
     /// One large, nearly symmetric hall
     Hall,
+    /// One large hall with rows of pallet racks, all alike but for what is stored in them
+    Warehouse,
 }
 
 /// What kind of sensor to simulate.
@@ -129,9 +134,11 @@ impl SimulateArgs {
                     Kind::Corridor => Layout::Corridor,
                     Kind::TwinRooms => Layout::TwinRooms,
                     Kind::Hall => Layout::Hall,
+                    Kind::Warehouse => Layout::Warehouse,
                 },
                 rooms: self.rooms,
                 density: self.density,
+                moved: self.moved,
                 hazards: Hazards {
                     glass: self.glass,
                     mirrors: self.mirrors,
@@ -242,6 +249,8 @@ struct ScanFacts {
     room: Option<usize>,
     /// Rooms of a building with the same number are furnished alike.
     furnished_like: Option<u64>,
+    /// Furniture may have been moved between two visits.
+    visit: usize,
     points: usize,
 }
 
@@ -268,7 +277,13 @@ fn write_facts(survey: &Survey, out: &Path) -> anyhow::Result<()> {
             let room = survey.room_of(scan);
             let rooms = survey.buildings.get(scan.building).map(|building| &building.rooms);
             let furnished_like = room.and_then(|room| rooms?.get(room)).map(|room| room.identity);
-            let facts = ScanFacts { building: scan.building, room, furnished_like, points: scan.cloud.len() };
+            let facts = ScanFacts {
+                building: scan.building,
+                room,
+                furnished_like,
+                visit: scan.visit,
+                points: scan.cloud.len(),
+            };
             (file.as_str(), facts)
         })
         .collect();

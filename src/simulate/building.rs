@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::draw::Draw;
 use super::footprint::Footprint;
-use super::furnish::furnish;
+use super::furnish::{Furniture, furnish};
 use super::hazards::{Hazards, darken, glaze, hazardous};
 use super::openings::Doorway;
 use super::plan::{Layout, Room, draw_plan};
@@ -26,6 +26,8 @@ pub struct BuildingOptions {
     pub room_size: [f32; 2],
     /// How much stands in the rooms: 0 is empty, 1 is usual, 2 is packed.
     pub density: f32,
+    /// Share of the furniture that stands elsewhere at a second visit, 0 to 1.
+    pub moved: f32,
     /// What makes scans disagree about free space.
     pub hazards: Hazards,
 }
@@ -37,6 +39,7 @@ impl Default for BuildingOptions {
             rooms: 6,
             room_size: [4.0, 7.0],
             density: 1.0,
+            moved: 0.0,
             hazards: Hazards::default(),
         }
     }
@@ -56,7 +59,7 @@ pub enum BuildingError {
     Density(f32),
     /// Negative, not a number, or more than all.
     #[error("the share of {0} must lie between 0 and 1, not {1}")]
-    Hazard(&'static str, f32),
+    Share(&'static str, f32),
 }
 
 impl BuildingOptions {
@@ -73,7 +76,10 @@ impl BuildingOptions {
             return Err(BuildingError::Density(self.density));
         }
         if let Some((hazard, share)) = self.hazards.first_wrong() {
-            return Err(BuildingError::Hazard(hazard, share));
+            return Err(BuildingError::Share(hazard, share));
+        }
+        if !(0.0..=1.0).contains(&self.moved) {
+            return Err(BuildingError::Share("moved furniture", self.moved));
         }
         Ok(())
     }
@@ -84,10 +90,13 @@ impl BuildingOptions {
 pub struct Building {
     /// Everything that a ray can meet.
     pub scene: Scene,
+    /// The same at a second visit, if furniture has been moved by then.
+    pub later: Option<Scene>,
     /// The insides of the rooms.
     pub rooms: Vec<Room>,
     /// The passages that link the rooms.
     pub doorways: Vec<Doorway>,
+    /// Of the furniture at all visits.
     footprints: Vec<Footprint>,
 }
 
@@ -97,36 +106,51 @@ impl Building {
         options.validate()?;
         let mut plan = draw_plan(options.layout, options.rooms, options.room_size, seed);
         glaze(&mut plan, &options.hazards, seed);
-        let furnished: Vec<_> = plan
+        let furnished: Vec<[Furniture; 2]> = plan
             .rooms
             .par_iter()
             .map(|room| {
-                let (mut solids, footprints) = furnish(room, &plan, options.density, seed);
                 let draw = |purpose| Draw::new(seed.derive(purpose, u128::from(room.identity)));
-                darken(&mut solids, options.hazards.dark, &mut draw("simulate.dark"));
-                paint(&mut solids, [40, 230], &mut draw("simulate.paint"));
-                (solids, footprints)
+                let mut visits = furnish(room, &plan, options.density, options.moved, seed);
+                for Furniture { solids, .. } in &mut visits {
+                    darken(solids, options.hazards.dark, &mut draw("simulate.dark"));
+                    paint(solids, [40, 230], &mut draw("simulate.paint"));
+                }
+                visits
             })
             .collect();
         let mut solids = shell(&plan);
         solids.extend(hazardous(&plan, &options.hazards, seed));
         paint(&mut solids, [170, 240], &mut Draw::new(seed.derive("simulate.paint", u128::MAX)));
-        let mut footprints = Vec::new();
-        for (room_solids, room_footprints) in furnished {
-            solids.extend(room_solids);
-            footprints.extend(room_footprints);
-        }
-        Ok(Self { scene: Scene::new(&solids), rooms: plan.rooms, doorways: plan.doorways, footprints })
+        let scene_at = |visit: usize| {
+            let furniture = furnished.iter().flat_map(|visits| &visits[visit].solids);
+            Scene::new(&solids.iter().chain(furniture).cloned().collect::<Vec<_>>())
+        };
+        let later = (options.moved > 0.0).then(|| scene_at(1));
+        let visits = 1 + usize::from(later.is_some());
+        let footprints =
+            furnished.iter().flat_map(|all| &all[..visits]).flat_map(|one| one.footprints.clone()).collect();
+        Ok(Self { scene: scene_at(0), later, rooms: plan.rooms, doorways: plan.doorways, footprints })
     }
 
-    /// Whether a place is inside a room or a doorway and at least `clearance` metres away from every surface.
+    /// What a ray can meet at a visit, from 0.
+    #[must_use]
+    pub fn scene_at(&self, visit: usize) -> &Scene {
+        self.later.as_ref().filter(|_| visit > 0).unwrap_or(&self.scene)
+    }
+
+    /// Whether a place is inside a room or a doorway and at least `clearance` metres away from every surface, at any visit.
     ///
     /// Walls and furniture are probed by rays into `PROBES` directions, so a thin rod may stand a little closer.
     #[must_use]
     pub fn is_clear(&self, place: &Vector3<f32>, clearance: f32) -> bool {
         self.is_free_floor([place.x, place.y], clearance)
             && probes().all(|direction| {
-                self.scene.cast(&Ray { origin: *place, direction }, 0.0, clearance).is_none()
+                let ray = Ray { origin: *place, direction };
+                [Some(&self.scene), self.later.as_ref()]
+                    .into_iter()
+                    .flatten()
+                    .all(|scene| scene.cast(&ray, 0.0, clearance).is_none())
             })
     }
 
@@ -177,7 +201,14 @@ mod tests {
 
     #[test]
     fn rooms_are_closed_but_for_doors_and_windows() {
-        for layout in [Layout::Office, Layout::House, Layout::Corridor, Layout::TwinRooms, Layout::Hall] {
+        for layout in [
+            Layout::Office,
+            Layout::House,
+            Layout::Corridor,
+            Layout::TwinRooms,
+            Layout::Hall,
+            Layout::Warehouse,
+        ] {
             let options = BuildingOptions { layout, density: 0.0, ..BuildingOptions::default() };
             let building = Building::new(&options, Seed(5)).unwrap();
             for room in &building.rooms {

@@ -14,30 +14,72 @@ use crate::control::Seed;
 
 /// Places that are tried for one piece.
 const TRIES: usize = 30;
+/// Between pieces at a wall, metres.
+const GAP_AT_WALL: f32 = 0.04;
+/// Around pieces that stand anywhere, metres.
+const GAP_ANYWHERE: f32 = 0.45;
+
+/// Furniture in the world frame.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Furniture {
+    pub solids: Vec<Solid>,
+    /// Of what stands on the floor.
+    pub footprints: Vec<Footprint>,
+}
+
+/// What keeps a piece where it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Place {
+    /// The building, or its weight.
+    Fixed,
+    /// Nothing, but its back belongs to a wall.
+    AtWall,
+    /// Nothing.
+    Free,
+}
+
+/// A piece on the floor of a room.
+struct Standing {
+    piece: Piece,
+    footprint: Footprint,
+    place: Place,
+}
+
+impl Standing {
+    /// Whether one can walk and put things on it.
+    fn is_flat(&self) -> bool {
+        is_flat(&self.piece)
+    }
+}
+
+fn is_flat(piece: &Piece) -> bool {
+    piece.height < 0.03
+}
 
 /// A room in its own frame: origin in the middle of the floor, x and y along its edges.
 struct Furnisher<'a> {
     room: &'a Room,
     half: [f32; 2],
     draw: Draw,
-    solids: Vec<Solid>,
-    taken: Vec<Footprint>,
+    standing: Vec<Standing>,
+    /// On walls and under the ceiling.
+    hung: Vec<Solid>,
     /// Kept free for walking: only things on walls and ceilings may be here.
     reserved: Vec<Footprint>,
     /// In front of windows, where nothing tall stands.
     windows: Vec<Footprint>,
 }
 
-/// The furniture of a room, and the footprints of what stands on its floor, in the world frame.
-pub(super) fn furnish(room: &Room, plan: &Plan, density: f32, seed: Seed) -> (Vec<Solid>, Vec<Footprint>) {
-    let draw = Draw::new(seed.derive("simulate.furniture", u128::from(room.identity)));
+/// The furniture of a room; and how it stands later, when a share of what can be moved has been.
+pub(super) fn furnish(room: &Room, plan: &Plan, density: f32, moved: f32, seed: Seed) -> [Furniture; 2] {
+    let draw = |purpose| Draw::new(seed.derive(purpose, u128::from(room.identity)));
     let half = room.size().map(|edge| edge * 0.5);
     let mut furnisher = Furnisher {
         room,
         half,
-        draw,
-        solids: Vec::new(),
-        taken: Vec::new(),
+        draw: draw("simulate.furniture"),
+        standing: Vec::new(),
+        hung: Vec::new(),
         reserved: Vec::new(),
         windows: Vec::new(),
     };
@@ -45,10 +87,12 @@ pub(super) fn furnish(room: &Room, plan: &Plan, density: f32, seed: Seed) -> (Ve
     if density > 0.0 {
         furnisher.fill(density);
     }
-    let (turn, centre) = (if room.turned { PI } else { 0.0 }, room.centre());
-    let whole = Piece { solids: furnisher.solids, ..Piece::default() };
-    let footprints = furnisher.taken.iter().map(|footprint| footprint.turned_into(centre, turn)).collect();
-    (whole.placed([centre[0], centre[1], 0.0], turn), footprints)
+    let before = furnisher.furniture();
+    if moved > 0.0 {
+        furnisher.draw = draw("simulate.moved");
+        furnisher.rearrange(moved);
+    }
+    [before, furnisher.furniture()]
 }
 
 impl Furnisher<'_> {
@@ -78,8 +122,10 @@ impl Furnisher<'_> {
     fn fill(&mut self, density: f32) {
         let Suite { middle, needed, walls, free } = suite(self.room.kind);
         let [width, depth] = self.half.map(|half| 2.0 * half);
-        if self.room.kind == RoomKind::Hall {
-            self.fill_hall();
+        match self.room.kind {
+            RoomKind::Hall => self.fill_hall(),
+            RoomKind::Warehouse => self.fill_warehouse(density),
+            _ => {}
         }
         for make in middle {
             let piece = make(&mut self.draw);
@@ -118,41 +164,60 @@ impl Furnisher<'_> {
                     [-size * 0.5, -size * 0.5, 0.0].into(),
                     [size * 0.5, size * 0.5, self.room.height].into(),
                 ));
-                self.try_place(&pillar, [sign * px * x, sign * py * y], 0.0, 0.0);
+                self.try_place(&pillar, [sign * px * x, sign * py * y], 0.0, 0.0, Place::Fixed);
             }
         }
         for _ in 0..14 {
             let piece = f::long_table(&mut self.draw);
             let at = [self.draw.between(-0.8, 0.8) * x, self.draw.between(0.05, 0.75) * y];
             let angle = self.draw.between(-0.3, 0.3);
-            if self.try_place(&piece, at, angle, 0.4) {
-                self.try_place(&piece, at.map(|c| -c), angle + PI, 0.4);
+            if self.try_place(&piece, at, angle, 0.4, Place::Free) {
+                self.try_place(&piece, at.map(|c| -c), angle + PI, 0.4, Place::Free);
             }
         }
     }
 
+    /// Rows of pallet racks with aisles between, every bay like the next one but for what is stored in it.
+    fn fill_warehouse(&mut self, density: f32) {
+        let aisle = self.draw.between(2.4, 3.2);
+        let levels = self.draw.count(3, 4);
+        let (pitch, [width, depth]) = (f::PALLET_RACK_DEPTH + aisle, self.half.map(|half| 2.0 * half));
+        // One walks around all rows.
+        let bays = ((width - 2.0 * aisle) / f::PALLET_RACK_BAY).floor().max(1.0) as usize;
+        let rows = ((depth - aisle) / pitch).floor().max(1.0) as usize;
+        for row in 0..rows {
+            let rack = f::pallet_rack(&mut self.draw, bays, levels, (0.7 * density).min(0.95));
+            let y = (row as f32 + 0.5 - rows as f32 * 0.5) * pitch;
+            self.try_place(&rack, [0.0, y], 0.0, 0.0, Place::Fixed);
+        }
+    }
+
     /// Puts a piece where nothing else is, or says that something is.
-    fn try_place(&mut self, piece: &Piece, at: [f32; 2], angle: f32, gap: f32) -> bool {
+    fn try_place(&mut self, piece: &Piece, at: [f32; 2], angle: f32, gap: f32, place: Place) -> bool {
         let footprint = Footprint { centre: at, half: piece.half, angle, top: piece.height };
+        let fits = self.fits(piece, &footprint, gap, None);
+        if fits {
+            self.standing.push(Standing { piece: piece.clone(), footprint, place });
+        }
+        fits
+    }
+
+    /// Whether a piece can stand somewhere, `moved` (the number of one that stands) being carried away.
+    fn fits(&self, piece: &Piece, footprint: &Footprint, gap: f32, moved: Option<usize>) -> bool {
         let inside = (0..2).all(|k| {
             let axis = if k == 0 { [1.0, 0.0] } else { [0.0, 1.0] };
-            at[k].abs() + footprint.reach_along(axis) < self.half[k]
+            footprint.centre[k].abs() + footprint.reach_along(axis) < self.half[k]
         });
-        let flat = piece.height < 0.03;
-        let blocked = self.taken.iter().any(|other| other.overlaps(&footprint, gap))
-            || (!flat && self.reserved.iter().any(|zone| zone.overlaps(&footprint, 0.0)))
-            || self
-                .windows
-                .iter()
-                .any(|zone| piece.height > zone.top + 0.1 && zone.overlaps(&footprint, 0.0));
-        if !inside || blocked {
-            return false;
-        }
-        self.solids.extend(piece.placed([at[0], at[1], 0.0], angle));
-        if !flat {
-            self.taken.push(footprint);
-        }
-        true
+        let taken = self
+            .standing
+            .iter()
+            .enumerate()
+            .filter(|(i, other)| Some(*i) != moved && !other.is_flat())
+            .any(|(_, other)| other.footprint.overlaps(footprint, gap));
+        inside
+            && !taken
+            && (is_flat(piece) || !self.reserved.iter().any(|zone| zone.overlaps(footprint, 0.0)))
+            && !self.windows.iter().any(|zone| piece.height > zone.top + 0.1 && zone.overlaps(footprint, 0.0))
     }
 
     /// Tries places with the back to a wall.
@@ -161,31 +226,82 @@ impl Furnisher<'_> {
             return;
         }
         for _ in 0..TRIES {
-            let (side, along) = self.draw_side(piece.half[0]);
-            let skew = if self.draw.chance(0.25) {
-                self.draw.between(-0.25, 0.25)
-            } else {
-                self.draw.between(-0.03, 0.03)
-            };
-            let lean = skew.abs().sin() * piece.half[0] + skew.cos() * piece.half[1];
-            let away = lean + self.draw.between(0.015, 0.08);
-            let (at, angle) = self.at_wall(side, along, away);
-            if self.try_place(piece, at, angle + skew, 0.04) {
+            let (at, angle) = self.draw_at_wall(piece.half);
+            if self.try_place(piece, at, angle, GAP_AT_WALL, Place::AtWall) {
                 return;
             }
         }
     }
 
+    /// A place at a wall, and the turn that puts a piece's back there, more or less.
+    fn draw_at_wall(&mut self, half: [f32; 2]) -> ([f32; 2], f32) {
+        let (side, along) = self.draw_side(half[0]);
+        let skew = if self.draw.chance(0.25) {
+            self.draw.between(-0.25, 0.25)
+        } else {
+            self.draw.between(-0.03, 0.03)
+        };
+        let lean = skew.abs().sin() * half[0] + skew.cos() * half[1];
+        let away = lean + self.draw.between(0.015, 0.08);
+        let (at, angle) = self.at_wall(side, along, away);
+        (at, angle + skew)
+    }
+
     /// Tries places away from the walls.
     fn stand_anywhere(&mut self, piece: &Piece) {
         for _ in 0..TRIES {
-            let at = self.half.map(|half| self.draw.between(-half, half));
-            let angle =
-                if self.draw.chance(0.4) { self.draw.pick([0.0, FRAC_PI_2]) } else { self.draw.angle() };
-            if self.try_place(piece, at, angle, 0.45) {
+            let (at, angle) = self.draw_anywhere();
+            if self.try_place(piece, at, angle, GAP_ANYWHERE, Place::Free) {
                 return;
             }
         }
+    }
+
+    /// A place in the room and a turn.
+    fn draw_anywhere(&mut self) -> ([f32; 2], f32) {
+        let at = self.half.map(|half| self.draw.between(-half, half));
+        let angle = if self.draw.chance(0.4) { self.draw.pick([0.0, FRAC_PI_2]) } else { self.draw.angle() };
+        (at, angle)
+    }
+
+    /// Moves a share of what can be moved to other places; what finds none stays.
+    fn rearrange(&mut self, share: f32) {
+        for i in 0..self.standing.len() {
+            let place = self.standing[i].place;
+            if place == Place::Fixed || !self.draw.chance(share) {
+                continue;
+            }
+            let piece = self.standing[i].piece.clone();
+            for _ in 0..TRIES {
+                let ((at, angle), gap) = match place {
+                    Place::AtWall => (self.draw_at_wall(piece.half), GAP_AT_WALL),
+                    _ => (self.draw_anywhere(), GAP_ANYWHERE),
+                };
+                let footprint = Footprint { centre: at, angle, ..self.standing[i].footprint };
+                if self.fits(&piece, &footprint, gap, Some(i)) {
+                    self.standing[i].footprint = footprint;
+                    break;
+                }
+            }
+        }
+    }
+
+    /// What stands and hangs in the room now.
+    fn furniture(&self) -> Furniture {
+        let (turn, centre) = (if self.room.turned { PI } else { 0.0 }, self.room.centre());
+        let standing = self.standing.iter().flat_map(|standing| {
+            let Footprint { centre: [x, y], angle, .. } = standing.footprint;
+            standing.piece.placed([x, y, 0.0], angle)
+        });
+        let solids = standing.chain(self.hung.iter().cloned()).collect();
+        let whole = Piece { solids, ..Piece::default() };
+        let footprints = self
+            .standing
+            .iter()
+            .filter(|standing| !standing.is_flat())
+            .map(|standing| standing.footprint.turned_into(centre, turn))
+            .collect();
+        Furniture { solids: whole.placed([centre[0], centre[1], 0.0], turn), footprints }
     }
 
     /// A side (0: -y, 1: +x, 2: +y, 3: -x) and a place along it for something with half a width.
@@ -212,7 +328,7 @@ impl Furnisher<'_> {
     /// Pictures, boards and pipes on the walls; lamps and pipes on the ceiling.
     fn hang(&mut self, density: f32) {
         let [width, depth] = self.half.map(|half| 2.0 * half);
-        let mut hung: Vec<Footprint> = Vec::new();
+        let mut covered: Vec<Footprint> = Vec::new();
         for _ in 0..((width + depth) * 0.7 * density).round() as usize {
             let kind = self.draw.count(0, 4);
             let piece = match kind {
@@ -224,10 +340,10 @@ impl Furnisher<'_> {
             let (at, angle) = self.at_wall(side, along, 0.0);
             let footprint = Footprint { centre: at, half: [piece.half[0] + 0.05, 0.1], angle, top: 0.0 };
             let z = if kind == 1 { 0.0 } else { self.draw.between(1.35, 1.75) };
-            let openings = self.reserved.iter().chain(&self.windows).chain(&hung);
+            let openings = self.reserved.iter().chain(&self.windows).chain(&covered);
             if openings.into_iter().all(|other| !other.overlaps(&footprint, 0.05)) {
-                self.solids.extend(piece.placed([at[0], at[1], z], angle));
-                hung.push(footprint);
+                self.hung.extend(piece.placed([at[0], at[1], z], angle));
+                covered.push(footprint);
             }
         }
         let height = self.room.height;
@@ -240,7 +356,7 @@ impl Furnisher<'_> {
             let y = ((i / columns) as f32 + 0.5) / rows as f32 * depth - self.half[1];
             if self.draw.chance(0.75) {
                 let at = [x + self.draw.between(-0.3, 0.3), y + self.draw.between(-0.3, 0.3), height];
-                self.solids.extend(lamp.placed(at, turn));
+                self.hung.extend(lamp.placed(at, turn));
             }
         }
         for _ in 0..self.draw.count(0, 2) {
@@ -248,7 +364,7 @@ impl Furnisher<'_> {
             let pipe = f::ceiling_pipe(&mut self.draw, 2.0 * self.half[axis]);
             let aside = self.draw.between(-0.9, 0.9) * self.half[1 - axis];
             let at = if axis == 0 { [0.0, aside, height] } else { [aside, 0.0, height] };
-            self.solids.extend(pipe.placed(at, if axis == 0 { 0.0 } else { FRAC_PI_2 }));
+            self.hung.extend(pipe.placed(at, if axis == 0 { 0.0 } else { FRAC_PI_2 }));
         }
     }
 }

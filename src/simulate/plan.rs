@@ -18,6 +18,8 @@ pub enum Layout {
     TwinRooms,
     /// One large hall that is nearly the same after half a turn.
     Hall,
+    /// One large hall with rows of pallet racks, every bay of which is like the next one but for what is stored in it.
+    Warehouse,
 }
 
 /// What a room is used for, and so what stands in it.
@@ -39,6 +41,8 @@ pub enum RoomKind {
     Passage,
     /// Large, with pillars.
     Hall,
+    /// Rows of pallet racks.
+    Warehouse,
 }
 
 /// The inside of a room.
@@ -117,7 +121,9 @@ pub(super) fn draw_plan(layout: Layout, rooms: usize, size: [f32; 2], seed: Seed
 fn draw_rows(layout: Layout, rooms: usize, [small, large]: [f32; 2], draw: &mut Draw) -> Vec<Row> {
     let row = |start, depth, widths| Row { start, depth, widths, passage: false };
     match layout {
-        Layout::Hall => vec![row(0.0, draw.between(1.8, 2.2) * large, vec![draw.between(2.4, 3.0) * large])],
+        Layout::Hall | Layout::Warehouse => {
+            vec![row(0.0, draw.between(1.8, 2.2) * large, vec![draw.between(2.4, 3.0) * large])]
+        }
         Layout::Corridor | Layout::TwinRooms => {
             let twin = [draw.between(small, large), draw.between(small, large)];
             let mut side = |count: usize| {
@@ -161,7 +167,11 @@ fn draw_rows(layout: Layout, rooms: usize, [small, large]: [f32; 2], draw: &mut 
 
 /// Lays the rows above each other and puts walls around all rooms.
 fn raise(layout: Layout, rows: &[Row], draw: &mut Draw) -> Plan {
-    let ceiling = if layout == Layout::Hall { draw.between(4.2, 5.0) } else { draw.between(2.7, 3.1) };
+    let ceiling = match layout {
+        Layout::Hall => draw.between(4.2, 5.0),
+        Layout::Warehouse => draw.between(6.0, 7.5),
+        _ => draw.between(2.7, 3.1),
+    };
     let mut plan = Plan { rooms: Vec::new(), walls: Vec::new(), doorways: Vec::new(), height: ceiling };
     let mut y = 0.0;
     // For each line between rows: middle, thickness, and the stretch that the rows on both sides need.
@@ -174,7 +184,7 @@ fn raise(layout: Layout, rows: &[Row], draw: &mut Draw) -> Plan {
             plan.rooms.push(Room {
                 low: [x, y],
                 high: [x + width, y + row.depth],
-                height: if twin || layout == Layout::Hall {
+                height: if twin || matches!(layout, Layout::Hall | Layout::Warehouse) {
                     ceiling
                 } else {
                     ceiling - draw.between(0.0, 0.25)
@@ -213,12 +223,13 @@ fn upright(at: f32, y: f32, depth: f32, thickness: f32) -> Wall {
 }
 
 fn room_kind(layout: Layout, passage: bool, index: usize) -> RoomKind {
-    use RoomKind::{Bedroom, Hall, Kitchen, Living, Meeting, Office, Passage, Storage};
+    use RoomKind::{Bedroom, Hall, Kitchen, Living, Meeting, Office, Passage, Storage, Warehouse};
     if passage {
         return Passage;
     }
     let kinds = match layout {
         Layout::Hall => return Hall,
+        Layout::Warehouse => return Warehouse,
         Layout::TwinRooms => return Office,
         Layout::House => [Living, Kitchen, Bedroom, Office, Bedroom, Storage],
         Layout::Office | Layout::Corridor => [Office, Meeting, Office, Kitchen, Living, Storage],
@@ -230,8 +241,8 @@ fn room_kind(layout: Layout, passage: bool, index: usize) -> RoomKind {
 mod tests {
     use super::*;
 
-    const LAYOUTS: [Layout; 5] =
-        [Layout::Office, Layout::House, Layout::Corridor, Layout::TwinRooms, Layout::Hall];
+    const LAYOUTS: [Layout; 6] =
+        [Layout::Office, Layout::House, Layout::Corridor, Layout::TwinRooms, Layout::Hall, Layout::Warehouse];
 
     #[test]
     fn every_room_can_be_reached_through_doors() {

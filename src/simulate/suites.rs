@@ -91,6 +91,12 @@ pub(super) fn suite(kind: RoomKind) -> Suite {
             ],
             free: &[],
         },
+        RoomKind::Warehouse => Suite {
+            middle: &[],
+            needed: &[f::desk],
+            walls: &[f::cabinet, f::carton_stack, f::pallet, f::bench, f::bin],
+            free: &[f::pallet, f::carton_stack, f::bin],
+        },
         RoomKind::Hall => Suite {
             middle: &[],
             needed: &[],

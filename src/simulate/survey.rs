@@ -105,6 +105,8 @@ pub struct SimulatedScan {
     pub rig: usize,
     /// Which of the survey's buildings it shows.
     pub building: usize,
+    /// At which visit it was taken, from 0; furniture may have been moved between two.
+    pub visit: usize,
 }
 
 /// A simulated survey.
@@ -128,6 +130,7 @@ pub fn simulate(options: &SurveyOptions) -> Result<Survey, SurveyError> {
     let poses = choose_stations(&building, &options.sensor, options.stations, options.least_overlap, seed)?;
     let rigs = assign_rigs(&building, &poses, options.rigs);
     let names = draw_names(poses.len(), &mut Draw::new(seed.derive("simulate.names", 0)));
+    let stations = poses.len();
     let mut scans: Vec<SimulatedScan> = poses
         .into_par_iter()
         .zip(rigs)
@@ -135,16 +138,17 @@ pub fn simulate(options: &SurveyOptions) -> Result<Survey, SurveyError> {
         .enumerate()
         .map(|(station, ((model_from_scan, rig), name))| {
             let mut draw = Draw::new(seed.derive("simulate.people", station as u128));
+            let visit = usize::from(building.later.is_some() && 2 * station >= stations);
             let eye: Vector3<f32> = model_from_scan.translation.cast();
             let people: Scene = people_around(&building, &eye, options.people, &mut draw);
             let around = Surroundings {
-                scenes: &[&building.scene, &people],
+                scenes: &[building.scene_at(visit), &people],
                 ghosts: options.building.hazards.ghosts(),
                 colored: options.colored,
             };
             let mut cloud = acquire(&around, &options.sensor, &model_from_scan, seed, station as u64);
             expose(&mut cloud.colors, &mut Draw::new(seed.derive("simulate.exposure", station as u128)));
-            SimulatedScan { name, cloud, model_from_scan, rig, building: 0 }
+            SimulatedScan { name, cloud, model_from_scan, rig, building: 0, visit }
         })
         .collect();
     scans.sort_by(|a, b| a.name.cmp(&b.name));
@@ -179,6 +183,7 @@ mod tests {
     use super::*;
     use crate::simulate::overlap::Neighbourhood;
     use crate::simulate::plan::Layout;
+    use crate::simulate::solid::Ray;
 
     fn small(layout: Layout, sensor: Sensor, stations: usize) -> SurveyOptions {
         let building = BuildingOptions { layout, rooms: 4, ..BuildingOptions::default() };
@@ -259,6 +264,7 @@ mod tests {
             (Layout::Corridor, Sensor::panoramic(20_000), 12),
             (Layout::TwinRooms, Sensor::spinning_lidar(64), 10),
             (Layout::Hall, Sensor::spinning_lidar(64), 6),
+            (Layout::Warehouse, Sensor::panoramic(20_000), 8),
             (Layout::House, Sensor::depth_camera(160, 120), 30),
         ] {
             let survey = simulate(&small(layout, sensor, stations)).unwrap();
@@ -346,6 +352,32 @@ mod tests {
             assert_eq!(without.model_from_scan, with.model_from_scan);
             assert_ne!(without.cloud, with.cloud);
         }
+    }
+
+    #[test]
+    fn furniture_that_was_moved_is_elsewhere_in_half_of_the_scans_and_walls_are_not() {
+        let mut options = small(Layout::Office, Sensor::panoramic(8000), 6);
+        options.building.moved = 0.5;
+        let moved = simulate(&options).unwrap();
+        assert_eq!(moved.scans.iter().filter(|scan| scan.visit == 1).count(), 3);
+        let building = &moved.buildings[0];
+        for scan in &moved.scans {
+            let (eye, rotation) = (scan.model_from_scan.translation, scan.model_from_scan.rotation);
+            // How far a scan's points lie from what its rays would meet at the other visit.
+            let elsewhere = scan.cloud.points.iter().filter(|point| {
+                let ray = rotation * Vector3::from(**point).cast::<f64>();
+                let ray = Ray { origin: eye.cast(), direction: ray.normalize().cast() };
+                let met = building.scene_at(1 - scan.visit).cast(&ray, 0.0, 100.0);
+                met.is_none_or(|hit| (hit.distance - Vector3::from(**point).norm()).abs() > 0.1)
+            });
+            let share = elsewhere.count() as f32 / scan.cloud.len() as f32;
+            assert!((0.03..0.6).contains(&share), "{share} of {} has changed", scan.name);
+        }
+        options.building.moved = 1.1;
+        assert!(matches!(
+            simulate(&options),
+            Err(SurveyError::Building(BuildingError::Share("moved furniture", _)))
+        ));
     }
 
     #[test]

@@ -18,7 +18,10 @@ pub(super) use decor::{
     wall_pipe,
 };
 pub(super) use seats::{armchair, bed, bench, chair, office_chair, sofa};
-pub(super) use storage::{cabinet, drawers, kitchen_counter, rack, shelf, wardrobe};
+pub(super) use storage::{
+    PALLET_RACK_BAY, PALLET_RACK_DEPTH, cabinet, drawers, kitchen_counter, pallet, pallet_rack, rack, shelf,
+    wardrobe,
+};
 pub(super) use tables::{coffee_table, desk, dining_table, long_table};
 
 /// Turns about the vertical by an angle in radians.

@@ -162,3 +162,57 @@ pub(in crate::simulate) fn rack(draw: &mut Draw) -> Piece {
     }
     piece
 }
+
+/// Width of one bay of a [`pallet_rack`], metres: three pallets side by side.
+pub(in crate::simulate) const PALLET_RACK_BAY: f32 = 2.8;
+/// Depth of a [`pallet_rack`], metres.
+pub(in crate::simulate) const PALLET_RACK_DEPTH: f32 = 1.1;
+
+/// A row of a warehouse: bays of pallets between uprights, each place taken with a probability, from both sides the same.
+pub(in crate::simulate) fn pallet_rack(draw: &mut Draw, bays: usize, levels: usize, taken: f32) -> Piece {
+    let (width, level_height) = (bays as f32 * PALLET_RACK_BAY, 1.45);
+    let depth = PALLET_RACK_DEPTH;
+    let mut piece = Piece::new(width + 0.1, depth, level_height * (levels as f32 - 0.2));
+    for upright in 0..=bays {
+        let x = upright as f32 * PALLET_RACK_BAY - width * 0.5;
+        for side in [-1.0, 1.0] {
+            piece.block([x, side * (depth * 0.5 - 0.05), 0.0], [0.1, 0.1, piece.height]);
+        }
+    }
+    for level in 0..levels {
+        let z = level_height * level as f32;
+        if level > 0 {
+            for side in [-1.0, 1.0] {
+                piece.block([0.0, side * (depth * 0.5 - 0.05), z - 0.12], [width, 0.05, 0.12]);
+            }
+        }
+        for slot in 0..3 * bays {
+            if draw.chance(taken) {
+                let x = (slot as f32 + 0.5) * PALLET_RACK_BAY / 3.0 - width * 0.5;
+                let pallet = pallet(draw);
+                piece.add(&pallet, [x + draw.between(-0.03, 0.03), draw.between(-0.08, 0.08), z], 0.0);
+            }
+        }
+    }
+    piece
+}
+
+/// A pallet with goods in one block, or in cartons of several heights.
+pub(in crate::simulate) fn pallet(draw: &mut Draw) -> Piece {
+    let (width, depth, board) = (0.8, 1.0, 0.14);
+    let mut piece = Piece::new(width, depth, 1.2);
+    piece.block([0.0, 0.0, board - 0.03], [width, depth, 0.03]);
+    for x in [-0.35, 0.0, 0.35] {
+        piece.block([x, 0.0, 0.0], [0.1, depth, board - 0.03]);
+    }
+    if draw.chance(0.5) {
+        let size = [draw.between(0.6, 0.8), draw.between(0.7, 1.0), draw.between(0.3, 1.0)];
+        piece.block([0.0, draw.between(-0.05, 0.05), board], size);
+    } else {
+        for (x, y) in [(-0.2, -0.25), (0.2, -0.25), (-0.2, 0.25), (0.2, 0.25)] {
+            let size = [draw.between(0.3, 0.4), draw.between(0.35, 0.48), draw.between(0.1, 0.95)];
+            piece.block([x, y, board], size);
+        }
+    }
+    piece
+}
