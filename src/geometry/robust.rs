@@ -52,6 +52,20 @@ impl Kernel {
         }
     }
 
+    /// [`Kernel::rho`] and [`Kernel::weight`] of several squared residuals.
+    #[must_use]
+    #[inline]
+    pub fn of_each<const N: usize>(self, squares: &[f64; N]) -> ([f64; N], [f64; N]) {
+        if let Self::GemanMcClure(c) = self {
+            // Both are made of the same division.
+            let shares = squares.map(|s| c * c / (c * c + s));
+            let mut costs = *squares;
+            costs.iter_mut().zip(&shares).for_each(|(cost, share)| *cost *= share);
+            return (costs, shares.map(|share| share * share));
+        }
+        (squares.map(|s| self.rho(s)), squares.map(|s| self.weight(s)))
+    }
+
     /// The scale c in metres, or `None` for [`Kernel::Squared`], which has none.
     #[must_use]
     pub fn scale(self) -> Option<f64> {

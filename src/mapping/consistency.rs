@@ -8,7 +8,7 @@ use super::component::Component;
 use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
-use crate::graph::{Edge, ScanGraph, evidence};
+use crate::graph::{Edge, ScanGraph, Supported, evidence};
 use crate::pairwise::centred_difference;
 
 /// An adjustment threw a scan when it keeps less than this share of its support …
@@ -16,19 +16,27 @@ const KEPT_SHARE: f64 = 0.5;
 /// … and lost at least this much, or what the most lenient join asks for.
 const LEAST_LOSS: f64 = 2.0;
 
+/// The best hypothesis of an edge that agrees with a pose of its scans.
+#[must_use]
+pub fn agreeing<'g>(
+    graph: &ScanGraph,
+    edge: &'g Edge,
+    a_from_b: &Pose,
+    options: &MappingOptions,
+) -> Option<&'g Supported> {
+    let b = graph.scan(edge.pair.b)?;
+    let reach = options.cluster_voxels * b.prepared.resolution;
+    let agrees = |h: &&Supported| {
+        let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, a_from_b, &b.centroid);
+        angle < options.cluster_angle && distance < reach
+    };
+    edge.hypotheses.iter().filter(agrees).max_by(|x, y| x.score.total_cmp(&y.score))
+}
+
 /// The evidence of the best hypothesis of an edge that agrees with a pose of its scans.
 #[must_use]
 pub fn edge_support(graph: &ScanGraph, edge: &Edge, a_from_b: &Pose, options: &MappingOptions) -> f64 {
-    let Some(b) = graph.scan(edge.pair.b) else { return 0.0 };
-    let reach = options.cluster_voxels * b.prepared.resolution;
-    edge.hypotheses
-        .iter()
-        .filter(|h| {
-            let (angle, distance) = centred_difference(&h.hypothesis.a_from_b, a_from_b, &b.centroid);
-            angle < options.cluster_angle && distance < reach
-        })
-        .map(|h| evidence(h.score))
-        .fold(0.0, f64::max)
+    agreeing(graph, edge, a_from_b, options).map_or(0.0, |h| evidence(h.score))
 }
 
 /// Support between all pairs of a component's scans at its poses; pairs without any are left out. What a client joined is firm.

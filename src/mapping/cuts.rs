@@ -72,6 +72,37 @@ pub fn bridge(
     })
 }
 
+/// A piece of which only one scan outside sees anything, and that little: all pairs between the two are `slight`. The pairs of one scan with a piece
+/// are no independent witnesses, as they look at the same surfaces. Of the piece and the rest, the smaller; `None` if there is none.
+#[must_use]
+pub fn glimpse(
+    component: &Component,
+    supports: &BTreeMap<(ScanKey, ScanKey), f64>,
+    slight: &BTreeSet<(ScanKey, ScanKey)>,
+) -> Option<BTreeSet<ScanKey>> {
+    let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
+    let index = |scan: &ScanKey| keys.binary_search(scan).ok();
+    let links: Vec<(usize, usize, bool)> = supports
+        .iter()
+        .filter(|(_, support)| **support >= LEAST_WORD)
+        .filter_map(|(pair, _)| Some((index(&pair.0)?, index(&pair.1)?, slight.contains(pair))))
+        .collect();
+    let looks = |scan: usize| {
+        let of_scan = move |link: &&(usize, usize, bool)| link.2 && (link.0 == scan || link.1 == scan);
+        links.iter().filter(of_scan).map(move |link| if link.0 == scan { link.1 } else { link.0 })
+    };
+    (0..keys.len()).find_map(|scan| {
+        looks(scan).next()?;
+        let others = links.iter().filter(|link| !(link.2 && (link.0 == scan || link.1 == scan)));
+        let groups = tied(keys.len(), others.map(|&(a, b, _)| (a, b, 0.0)));
+        let group_of = |scan: usize| groups.iter().find(|group| group.contains(&scan));
+        let own = group_of(scan).filter(|own| own.len() >= PIECE)?;
+        let seen = looks(scan).filter(|other| !own.contains(other)).find_map(group_of);
+        let piece = seen.filter(|seen| seen.len() >= PIECE)?;
+        Some(smaller_side(component, piece.iter().map(|scan| keys[*scan]).collect()))
+    })
+}
+
 /// The same cut by the side with fewer scans.
 #[must_use]
 pub fn smaller_side(component: &Component, side: BTreeSet<ScanKey>) -> BTreeSet<ScanKey> {
@@ -249,6 +280,27 @@ mod tests {
         assert!(
             side == BTreeSet::from([key(1), key(2), key(3)])
                 || side == BTreeSet::from([key(4), key(5), key(6)])
+        );
+    }
+
+    #[test]
+    fn a_piece_of_which_one_scan_alone_sees_little_is_found() {
+        let component = six();
+        let pieces = [(1, 2), (2, 3), (1, 3), (4, 5), (5, 6)];
+        let find = |more: &[(u128, u128)], slight: &[(u128, u128)]| {
+            let pairs = |pairs: &[(u128, u128)]| -> BTreeSet<(ScanKey, ScanKey)> {
+                pairs.iter().map(|(a, b)| (ScanKey(*a), ScanKey(*b))).collect()
+            };
+            let supports = pairs(&[&pieces[..], more].concat()).into_iter().map(|pair| (pair, 4.0)).collect();
+            glimpse(&component, &supports, &pairs(slight))
+        };
+        let three = Some([4, 5, 6].map(ScanKey).into());
+        assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4), (3, 5)]), three);
+        assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4)]), None, "one pair shares much");
+        assert_eq!(find(&[(3, 4), (2, 5)], &[(3, 4), (2, 5)]), None, "two scans see something");
+        assert_eq!(
+            find(&[(1, 4), (2, 4), (3, 4)], &[(1, 4), (2, 4), (3, 4)]).map(|side| side.len()),
+            Some(3)
         );
     }
 

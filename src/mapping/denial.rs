@@ -2,7 +2,7 @@
 //! in what the other saw to be empty, by far more than either does elsewhere, so that by themselves they are less sure than pairs that share as
 //! much. Third scans talked them down. Where a scan is a little off, or bent, surfaces do not lie so well; and where one scan saw what is gone, it is in all such pairs. Where
 //! surfaces lie well and no single scan is to blame, those third scans took alike places for one: identical rooms differ by a box on the
-//! floor, and the ends of a corridor are not where its other scans see floor. Used by `undo`.
+//! floor, and the ends of a corridor are not where its other scans see floor. Used by `finding` and `testimony`.
 
 use std::collections::BTreeMap;
 
@@ -40,8 +40,20 @@ const USUAL: f64 = 0.25;
 const DENIED_PAIRS: usize = 3;
 /// … and of all pairs that share as much, this share does. Of scans that are where they belong hardly any pair does.
 const DENIED_SHARE: f64 = 0.01;
+/// Where this share of all pairs shares much, as all do in rooms that were folded onto each other, one pair is enough: what has changed there would
+/// be seen by many. …
+const CROWDED: f64 = 0.5;
+/// … Each of its scans shares much with so many others, …
+const LEAST_SHARING: usize = 6;
+/// … of which it denies less than this share, as it would if it were to blame, …
+const BLAMED_SHARE: f64 = 0.25;
+/// … and the pair lies in free space by this many times what is usual …
+const STRONG_CONTRAST: f64 = 8.0;
+/// … and this share more: four in seven rooms with a corridor whose ends are seen by one pair, 1.9 %; where halls of moved furniture are right, none.
+const STRONG_FLOOR: f64 = 0.012;
 
 /// A pair as it stands in the component.
+#[derive(Debug, Clone, Copy)]
 struct Seen {
     contradiction: Contradiction,
     logit: f64,
@@ -50,29 +62,101 @@ struct Seen {
     fits_well: bool,
 }
 
-/// The surest of the pairs that deny a component, if they show that alike places were taken for one. Pairs that a client decided about are not
-/// asked.
-#[must_use]
-pub fn denied(graph: &ScanGraph, component: &Component, options: &MappingOptions) -> Option<Contradiction> {
-    let mut seen: Vec<Seen> = Vec::new();
-    for a in component.poses.keys() {
-        for b in graph.neighbors(*a).filter(|b| b > a) {
-            let asked = graph.edge(*a, b).filter(|edge| !options.decisions.concern(edge.pair));
-            seen.extend(asked.and_then(|edge| as_it_stands(graph, component, edge)));
-        }
+impl Seen {
+    fn scans(&self) -> [ScanKey; 2] {
+        [self.contradiction.pair.a, self.contradiction.pair.b]
     }
-    let usual = usual(&seen);
-    let shares_much = |pair: &&Seen| pair.overlap >= MUCH;
-    let denies = |pair: &&Seen| {
-        let scans = [pair.contradiction.pair.a, pair.contradiction.pair.b];
-        let usual = scans.map(|scan| usual.get(&scan).copied());
-        let [Some(x), Some(y)] = usual else { return false };
-        pair.fits_well && pair.logit < DENIES && pair.violation > CONTRAST * x.max(y) + FLOOR
-    };
-    let mut denying: Vec<&Seen> = seen.iter().filter(shares_much).filter(denies).collect();
-    denying.sort_by(|x, y| x.logit.total_cmp(&y.logit).then(x.contradiction.pair.cmp(&y.contradiction.pair)));
-    let enough = denying.len() as f64 >= DENIED_SHARE * seen.iter().filter(shares_much).count() as f64;
-    (enough && denying.len() >= DENIED_PAIRS && nobody_is_in_all(&denying)).then(|| denying[0].contradiction)
+
+    fn shares_much(&self) -> bool {
+        self.overlap >= MUCH
+    }
+}
+
+/// A pair that denies a component.
+#[derive(Debug, Clone, Copy)]
+struct Denial {
+    seen: Seen,
+    /// By far more than what is usual.
+    strong: bool,
+}
+
+/// What pairs deny of a component.
+#[derive(Debug, Clone)]
+pub struct Denials {
+    /// The surest first.
+    denying: Vec<Denial>,
+    /// With how many others each scan shares much.
+    sharing: BTreeMap<ScanKey, usize>,
+    scans: usize,
+}
+
+impl Denials {
+    /// Asks all pairs of a component, but for those that a client decided about.
+    #[must_use]
+    pub fn of(graph: &ScanGraph, component: &Component, options: &MappingOptions) -> Self {
+        let mut seen: Vec<Seen> = Vec::new();
+        for a in component.poses.keys() {
+            for b in graph.neighbors(*a).filter(|b| b > a) {
+                let asked = graph.edge(*a, b).filter(|edge| !options.decisions.concern(edge.pair));
+                seen.extend(asked.and_then(|edge| as_it_stands(graph, component, edge)));
+            }
+        }
+        let usual = usual(&seen);
+        seen.retain(Seen::shares_much);
+        let mut sharing = BTreeMap::new();
+        for scan in seen.iter().flat_map(Seen::scans) {
+            *sharing.entry(scan).or_default() += 1;
+        }
+        let denial = |seen: &Seen| {
+            let [Some(x), Some(y)] = seen.scans().map(|scan| usual.get(&scan).copied()) else { return None };
+            let usual = x.max(y);
+            let denies = seen.fits_well && seen.logit < DENIES && seen.violation > CONTRAST * usual + FLOOR;
+            let strong = seen.violation > STRONG_CONTRAST * usual + STRONG_FLOOR;
+            denies.then_some(Denial { seen: *seen, strong })
+        };
+        let mut denying: Vec<Denial> = seen.iter().filter_map(denial).collect();
+        denying.sort_by(|x, y| {
+            let by_pair = x.seen.contradiction.pair.cmp(&y.seen.contradiction.pair);
+            x.seen.logit.total_cmp(&y.seen.logit).then(by_pair)
+        });
+        Self { denying, sharing, scans: component.len() }
+    }
+
+    /// Whether no pair denies anything.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.denying.is_empty()
+    }
+
+    /// The surest of the pairs that show that alike places were taken for one, if any do.
+    #[must_use]
+    pub fn shown(&self) -> Option<Contradiction> {
+        let pairs_that_share = self.sharing.values().sum::<usize>() / 2;
+        let several = self.denying.len() >= DENIED_PAIRS
+            && self.denying.len() as f64 >= DENIED_SHARE * pairs_that_share as f64
+            && self.nobody_is_in_all();
+        let first = self.denying.first().filter(|_| several);
+        let crowded =
+            pairs_that_share as f64 >= CROWDED * (self.scans * self.scans.saturating_sub(1) / 2) as f64;
+        let alone = || self.denying.iter().find(|denial| crowded && self.is_enough(denial));
+        first.or_else(alone).map(|denial| denial.seen.contradiction)
+    }
+
+    /// Whether no scan is in all of the pairs.
+    fn nobody_is_in_all(&self) -> bool {
+        let in_all = |scan: ScanKey| self.denying.iter().all(|denial| denial.seen.scans().contains(&scan));
+        self.denying.first().is_none_or(|first| !first.seen.scans().into_iter().any(in_all))
+    }
+
+    /// Whether one pair is enough where all see the same place.
+    fn is_enough(&self, denial: &Denial) -> bool {
+        let stands_out = |scan: ScanKey| {
+            let sharing = self.sharing.get(&scan).copied().unwrap_or_default();
+            let denied = self.denying.iter().filter(|other| other.seen.scans().contains(&scan)).count();
+            sharing >= LEAST_SHARING && (denied as f64) < BLAMED_SHARE * sharing as f64
+        };
+        denial.strong && denial.seen.scans().into_iter().all(stands_out)
+    }
 }
 
 /// What a pair found of the pose that it has in the component. `None` if it did not look at that pose, or not at free space.
@@ -103,7 +187,7 @@ fn as_it_stands(graph: &ScanGraph, component: &Component, edge: &Edge) -> Option
 fn usual(seen: &[Seen]) -> BTreeMap<ScanKey, f64> {
     let mut shares: BTreeMap<ScanKey, Vec<f64>> = BTreeMap::new();
     for pair in seen.iter().filter(|pair| pair.logit > SURE) {
-        for scan in [pair.contradiction.pair.a, pair.contradiction.pair.b] {
+        for scan in pair.scans() {
             shares.entry(scan).or_default().push(pair.violation);
         }
     }
@@ -115,49 +199,34 @@ fn usual(seen: &[Seen]) -> BTreeMap<ScanKey, f64> {
     shares.into_iter().map(|(scan, shares)| (scan, usual(shares))).collect()
 }
 
-/// Whether no scan is in all of the pairs.
-fn nobody_is_in_all(pairs: &[&Seen]) -> bool {
-    let scans = |seen: &Seen| [seen.contradiction.pair.a, seen.contradiction.pair.b];
-    let Some(first) = pairs.first() else { return true };
-    scans(first).iter().all(|scan| pairs.iter().any(|pair| !scans(pair).contains(scan)))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::geometry::Pose;
     use crate::mapping::test_hall::Model;
-    use crate::pairwise::{Counts, Evidence, PairKey, PairResult};
-
-    /// A hall whose pairs say this of the pose they have, log-odds and points in free space: by default they are sure, with little in free space.
-    fn hall_of(said: &[((u128, u128), f64, u32)], inliers: u32, apart_voxels: f32) -> (Model, ScanGraph) {
-        let model = Model::new(6);
-        let mut graph = model.graph.clone();
-        let result = |a: u128, b: u128| {
-            let (logit, violations) = said
-                .iter()
-                .find(|(pair, ..)| *pair == (a, b))
-                .map_or((8.0, 2), |(_, logit, violations)| (*logit, *violations));
-            let apart = apart_voxels * model.hall.resolution as f32;
-            let plane_square = inliers as f32 * apart * apart;
-            let counts = Counts { points: 1000, inliers, violations, plane_square, ..Counts::default() };
-            let evidence =
-                Evidence { b_on_a: counts, a_on_b: counts, range_images: 2, ..Evidence::default() };
-            let a_from_b = model.contradiction((a, b), true).a_from_b;
-            PairResult {
-                pair: PairKey::of(ScanKey(a), ScanKey(b)),
-                matches: Vec::new(),
-                hypotheses: vec![Hypothesis { a_from_b, evidence, logit }],
-            }
-        };
-        let pairs = (1..=6).flat_map(|a| (a + 1..=6).map(move |b| (a, b)));
-        graph.add_results(pairs.map(|(a, b)| result(a, b)), &MappingOptions::default().support);
-        (model, graph)
-    }
 
     fn is_denied(said: &[((u128, u128), f64, u32)], inliers: u32, apart_voxels: f32) -> bool {
-        let (model, graph) = hall_of(said, inliers, apart_voxels);
-        denied(&graph, &model.component, &MappingOptions::default()).is_some()
+        is_denied_by(6, said, inliers, apart_voxels)
+    }
+
+    fn is_denied_by(
+        stations: usize,
+        said: &[((u128, u128), f64, u32)],
+        inliers: u32,
+        apart_voxels: f32,
+    ) -> bool {
+        let model = Model::new(stations);
+        let graph = model.graph_where(said, inliers, apart_voxels);
+        Denials::of(&graph, &model.component, &MappingOptions::default()).shown().is_some()
+    }
+
+    #[test]
+    fn where_all_see_the_same_place_one_pair_is_enough_unless_one_of_its_scans_is_off() {
+        let no = |pair, violations| (pair, -3.0, violations);
+        assert!(is_denied_by(8, &[no((1, 2), 40)], 600, 0.1));
+        assert!(!is_denied_by(8, &[no((1, 2), 16)], 600, 0.1), "that may be chance");
+        assert!(!is_denied_by(8, &[no((1, 2), 40), no((1, 3), 40)], 600, 0.1), "scan 1 is off");
+        assert!(!is_denied_by(6, &[no((1, 2), 40)], 600, 0.1), "few would see what has changed");
     }
 
     #[test]
@@ -186,14 +255,15 @@ mod tests {
     #[test]
     fn a_pose_that_a_pair_did_not_look_at_is_not_denied() {
         let no = [(1, 2), (3, 4), (5, 6)].map(|pair| (pair, -3.0, 40));
-        let (model, graph) = hall_of(&no, 600, 0.1);
+        let model = Model::new(6);
+        let graph = model.graph_where(&no, 600, 0.1);
         let options = MappingOptions::default();
         let mut moved = model.component.clone();
-        assert!(denied(&graph, &moved, &options).is_some());
+        assert!(Denials::of(&graph, &moved, &options).shown().is_some());
         for scan in [1, 3] {
             let pose = moved.poses.get_mut(&ScanKey(scan)).expect("a scan of the hall");
             *pose = Pose::from_translation(nalgebra::Vector3::x() * 30.0) * *pose;
         }
-        assert_eq!(denied(&graph, &moved, &options), None);
+        assert!(Denials::of(&graph, &moved, &options).is_empty());
     }
 }

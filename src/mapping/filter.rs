@@ -1,6 +1,6 @@
 //! Filtering: scans that belong elsewhere by now are taken out and may register again.
 
-use super::candidates::{best_candidate, support_of};
+use super::candidates::{Candidate, best_candidate, support_of};
 use super::component::Component;
 use super::mapper::Mapper;
 use super::options::MappingOptions;
@@ -19,8 +19,8 @@ const FILTER_FROM: usize = 4;
 const FILTER_MARGIN: f64 = 2.0;
 
 impl Mapper {
-    /// Filtering: takes out scans that have clearly more support at another pose than at their own. They wait, and may register
-    /// again. Returns how many.
+    /// Filtering: takes out scans that have clearly more support at another pose than at their own, in their component or in another. They wait,
+    /// and may register again. Returns how many.
     pub fn filter_scans(
         &mut self,
         graph: &ScanGraph,
@@ -29,7 +29,7 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<usize, Cancelled> {
         let mut misplaced: Vec<ScanKey> = Vec::new();
-        for component in self.components.iter().filter(|c| c.len() >= FILTER_FROM) {
+        for (index, component) in self.components.iter().enumerate().filter(|(_, c)| c.len() >= FILTER_FROM) {
             // Poses are all that is asked of the rest.
             let mut rest = Component {
                 gauge: component.gauge,
@@ -46,10 +46,21 @@ impl Mapper {
                 let best = best_candidate(graph, &rest, &single, voxel, options);
                 let own = support_of(graph, &rest, &single, pose, voxel, options).support;
                 rest.poses.insert(*scan, *pose);
-                if best.is_some_and(|best| {
-                    best.support > own + FILTER_MARGIN
-                        && differs(&best.a_from_b, pose, *scan, graph, voxel, options)
-                }) {
+                let better = |candidate: &Candidate| candidate.support > own + FILTER_MARGIN;
+                let elsewhere = best
+                    .filter(better)
+                    .is_some_and(|best| differs(&best.a_from_b, pose, *scan, graph, voxel, options));
+                let others = self.components.iter().enumerate().filter(|(other, _)| *other != index);
+                let held = options.decisions.joined_pairs().any(|pair| {
+                    let other = if pair.a == *scan { pair.b } else { pair.a };
+                    (pair.a == *scan || pair.b == *scan) && component.poses.contains_key(&other)
+                });
+                let in_another = || {
+                    let mut bests =
+                        others.filter_map(|(_, other)| best_candidate(graph, other, &single, voxel, options));
+                    bests.any(|best| better(&best))
+                };
+                if elsewhere || (!held && in_another()) {
                     misplaced.push(*scan);
                 }
             }
@@ -77,4 +88,46 @@ fn differs(
     let Some(scan) = graph.scan(scan) else { return false };
     let (angle, distance) = centred_difference(x, y, &scan.centroid);
     angle > options.rival_angle || distance > options.rival_voxels * voxel
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::control::{CancelToken, Silent};
+    use crate::mapping::decision::{Decision, Decisions, between_own_frames};
+    use crate::mapping::test_hall::Model;
+    use crate::pairwise::{PairKey, PairResult};
+
+    #[test]
+    fn a_scan_that_more_speaks_for_in_another_component_is_taken_out_unless_a_client_put_it_there() {
+        let model = Model::new(8);
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let mut graph = model.graph.clone();
+        let mut options = MappingOptions::default();
+        let silent = |a: u128| {
+            let pair = PairKey::of(ScanKey(a), ScanKey(8));
+            PairResult { pair, matches: Vec::new(), hypotheses: Vec::new() }
+        };
+        let first: Vec<ScanKey> = [1, 2, 3, 4, 8].map(ScanKey).to_vec();
+        let filtered = |graph: &ScanGraph, options: &MappingOptions| {
+            let part = |scans: &[ScanKey]| {
+                let poses = scans.iter().map(|scan| (*scan, model.component.poses[scan])).collect();
+                Component { gauge: scans[0], poses, tracks: Tracks::default() }
+            };
+            let components = vec![part(&first), part(&[5, 6, 7].map(ScanKey))];
+            let mut mapper = Mapper { components, ..Mapper::default() };
+            let count = mapper.filter_scans(graph, model.hall.resolution, options, control);
+            assert_eq!(count, Ok(mapper.waiting.len()));
+            mapper.waiting.into_keys().collect::<Vec<_>>()
+        };
+        assert_eq!(filtered(&graph, &options), [], "both know it");
+        graph.add_results([1, 2, 3, 4].map(silent), &options.support);
+        assert_eq!(filtered(&graph, &options), [ScanKey(8)]);
+        let local = model.contradiction((1, 8), true).a_from_b;
+        let decided =
+            between_own_frames(&graph, ScanKey(1), ScanKey(8), &local).expect("both are in the graph");
+        options.decisions = Decisions::new(&[Decision::join(ScanKey(1), ScanKey(8), &decided)]);
+        assert_eq!(filtered(&graph, &options), [], "a client has the last word");
+    }
 }

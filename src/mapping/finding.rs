@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::component::Component;
 use super::cuts::{separating_cut, smaller_side};
-use super::denial::denied;
+use super::denial::Denials;
 use super::hearing::{Hearing, Ruling};
 use super::intrusion::{Intrusion, intrusion};
 use super::options::MappingOptions;
@@ -74,7 +74,7 @@ impl Case<'_> {
         if let Some((_, side, _, _, true)) = &moved {
             return Ok(self.torn(side.clone()));
         }
-        if let Some(strongest) = denied(graph, component, options) {
+        if let Some(strongest) = Denials::of(graph, component, options).shown() {
             return Ok(Finding::Folded { strongest });
         }
         if let Some((strongest, side, scans, motion, _)) = moved {

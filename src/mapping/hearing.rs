@@ -53,6 +53,8 @@ pub struct Hearing<'g> {
     /// By the places of their scans among the keys; those without fine surfaces have nothing to say.
     pairs: Vec<(usize, usize, Option<Seen<'g>>)>,
     usual: Option<Counts>,
+    /// Whether no pair denies what the component makes of its scans, as far as is known.
+    undenied: bool,
 }
 
 impl<'g> Hearing<'g> {
@@ -71,7 +73,13 @@ impl<'g> Hearing<'g> {
         };
         let pairs = edges.par_iter().map(look).collect::<Result<Vec<_>, Cancelled>>()?;
         let usual = usual(&pairs);
-        Ok(Self { keys, pairs, usual })
+        Ok(Self { keys, pairs, usual, undenied: false })
+    }
+
+    /// Asks less for a refutation if no pair denies what the component makes of its scans.
+    #[must_use]
+    pub fn asking_less(self, undenied: bool) -> Self {
+        Self { undenied, ..self }
     }
 
     /// What becomes of the scans that these words, which agree with the first, would move. Where there are no fine surfaces, nothing tells.
@@ -93,7 +101,7 @@ impl<'g> Hearing<'g> {
             control.check()?;
             let (Some(stays), Some(moves)) = (index(word.stays()), index(word.moves)) else { continue };
             let Some(found) = Move::cheapest(&losses, stays, moves) else { continue };
-            if found.is_refuted() || self.is_idle(&found, waits) {
+            if found.is_refuted(self.undenied) || self.is_idle(&found, waits) {
                 continue;
             }
             let improved = found.descended(&losses);

@@ -5,14 +5,37 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::component::Component;
-use super::consistency::supports;
-use super::cuts::{bridge, loose_side};
+use super::consistency::{agreeing, supports};
+use super::cuts::{bridge, glimpse, loose_side};
 use super::join::Refusal;
 use super::mapper::Mapper;
 use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::ScanGraph;
+
+/// Scans that share less than this see little of each other: at the least, two walls and a floor, as there are many of.
+const SLIGHT: f64 = 0.2;
+
+/// The pairs with support whose scans see little of each other at the poses that they have.
+fn slight(
+    graph: &ScanGraph,
+    component: &Component,
+    supports: &Supports,
+    options: &MappingOptions,
+) -> BTreeSet<(ScanKey, ScanKey)> {
+    let shares_little = |(a, b): &(ScanKey, ScanKey)| {
+        let (Some(model_from_a), Some(model_from_b)) = (component.poses.get(a), component.poses.get(b))
+        else {
+            return false;
+        };
+        let edge = graph.edge(*a, *b).filter(|edge| !options.decisions.concern(edge.pair));
+        let now = model_from_a.inverse() * *model_from_b;
+        edge.and_then(|edge| agreeing(graph, edge, &now, options))
+            .is_some_and(|h| h.hypothesis.evidence.both().overlap() < SLIGHT)
+    };
+    supports.keys().filter(|pair| shares_little(pair)).copied().collect()
+}
 
 /// What pairs of a component's scans say for their poses.
 type Supports = BTreeMap<(ScanKey, ScanKey), f64>;
@@ -42,7 +65,7 @@ impl Mapper {
         Ok(())
     }
 
-    /// Parts components at their bridges that are not firm.
+    /// Parts components at their bridges that are not firm, and where one scan alone sees little of a piece.
     pub fn part_at_bridges(
         &mut self,
         graph: &ScanGraph,
@@ -51,6 +74,7 @@ impl Mapper {
     ) -> Result<(), Cancelled> {
         self.part(graph, options, control, |component, supports| {
             bridge(component, supports, options.firm_support)
+                .or_else(|| glimpse(component, supports, &slight(graph, component, supports, options)))
         })?;
         self.sort_components();
         Ok(())

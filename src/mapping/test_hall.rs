@@ -10,7 +10,7 @@ use crate::features::{PreparedScan, Scan};
 use crate::geometry::Pose;
 use crate::graph::{ScanGraph, SupportOptions};
 use crate::pairwise::test_survey::{Hall, hall};
-use crate::pairwise::{Evidence, Hypothesis, PairKey, PairResult};
+use crate::pairwise::{Counts, Evidence, Hypothesis, PairKey, PairResult};
 
 /// The hall, all its scans where they belong, and a graph in which every pair knows that.
 pub struct Model {
@@ -42,6 +42,38 @@ impl Model {
             *pose = self.hall.turned * *pose;
         }
         wrong
+    }
+
+    /// A graph whose pairs say this of the pose they have, log-odds and points in free space: by default they are sure, with little in free space. Of
+    /// 1,000 points, so many coincide, as far apart as that.
+    pub fn graph_where(
+        &self,
+        said: &[((u128, u128), f64, u32)],
+        inliers: u32,
+        apart_voxels: f32,
+    ) -> ScanGraph {
+        let result = |a: u128, b: u128| {
+            let (logit, violations) = said
+                .iter()
+                .find(|(pair, ..)| *pair == (a, b))
+                .map_or((8.0, 2), |(_, logit, violations)| (*logit, *violations));
+            let apart = apart_voxels * self.hall.resolution as f32;
+            let plane_square = inliers as f32 * apart * apart;
+            let counts = Counts { points: 1000, inliers, violations, plane_square, ..Counts::default() };
+            let evidence =
+                Evidence { b_on_a: counts, a_on_b: counts, range_images: 2, ..Evidence::default() };
+            let a_from_b = self.contradiction((a, b), true).a_from_b;
+            PairResult {
+                pair: PairKey::of(ScanKey(a), ScanKey(b)),
+                matches: Vec::new(),
+                hypotheses: vec![Hypothesis { a_from_b, evidence, logit }],
+            }
+        };
+        let stations = self.hall.scans.len() as u128;
+        let pairs = (1..=stations).flat_map(|a| (a + 1..=stations).map(move |b| (a, b)));
+        let mut graph = self.graph.clone();
+        graph.add_results(pairs.map(|(a, b)| result(a, b)), &SupportOptions::default());
+        graph
     }
 
     /// What a pair contradicts a component by that says that its ends are where they truly are, or that they are not.

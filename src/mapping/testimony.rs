@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 
 use super::component::Component;
+use super::denial::Denials;
 use super::hearing::{Hearing, Ruling};
 use super::options::MappingOptions;
 use super::voice::{Voice, Word, loudest, one_voice};
@@ -96,7 +97,8 @@ impl Testimony {
             let words = Word::both_ways(graph, component, &self.contradictions, options);
             let voice = loudest(&words, options.rival_angle);
             if hearing.is_none() {
-                hearing = Some(Hearing::open(graph, component, control)?);
+                let undenied = Denials::of(graph, component, options).is_empty();
+                hearing = Some(Hearing::open(graph, component, control)?.asking_less(undenied));
             }
             let ruling = match &hearing {
                 Some(hearing) => hearing.hear(&voice, waits, options, control)?,

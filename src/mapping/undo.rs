@@ -20,6 +20,9 @@ use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::ScanGraph;
 
+/// Scans of a component that one pair holds together.
+const PAIR: usize = 2;
+
 impl Mapper {
     /// Undoes what pairs contradict. Returns the poses that are not to be tried again while the model grows, or `None` if nothing
     /// was undone.
@@ -82,8 +85,11 @@ impl Mapper {
                 }
             }
         }
+        // Where places are alike, what only one pair holds together may be of two of them.
+        let alike = folded.values().next();
         for (origin, component) in sound {
-            match folded.get(&origin) {
+            let doubted = folded.get(&origin).or(alike.filter(|_| component.len() == PAIR));
+            match doubted {
                 Some((testimony, strongest)) => {
                     let supports = supports(graph, &component, options);
                     self.undone.push(record(&supports, scans_of(&component), strongest));
@@ -236,6 +242,31 @@ mod tests {
         assert_eq!(mapper.undone.len(), 1);
         let (mapper, bans) = undo(model.component.clone());
         assert!(bans.is_none() && mapper.components[0].len() == 6 && mapper.undone.is_empty());
+    }
+
+    #[test]
+    fn where_rooms_are_alike_what_one_pair_holds_together_waits_too() {
+        let model = Model::new(9);
+        let options = MappingOptions::default();
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let waiting = |graph: &ScanGraph, others: BTreeSet<ScanKey>| {
+            let mut large = model.component.clone();
+            let small = large.split_off(&others, &options);
+            let components = small.into_iter().chain([large]).collect();
+            let mut mapper = Mapper { components, ..Mapper::default() };
+            mapper
+                .undo_contradicted(graph, model.hall.resolution, &options, control)
+                .expect("nobody cancels");
+            assert_eq!(mapper.waiting.keys().copied().collect::<BTreeSet<_>>(), mapper.doubted);
+            mapper.waiting.len()
+        };
+        let (pair, three) = (BTreeSet::from([8, 9].map(ScanKey)), BTreeSet::from([7, 8, 9].map(ScanKey)));
+        let no = |a, b| ((a, b), -3.0, 40);
+        let denied = model.graph_where(&[no(1, 2), no(3, 4), no(5, 6)], 600, 0.1);
+        assert_eq!(waiting(&denied, pair.clone()), 9);
+        assert_eq!(waiting(&denied, three), 6);
+        assert_eq!(waiting(&model.graph_where(&[], 600, 0.1), pair), 0);
     }
 
     #[test]

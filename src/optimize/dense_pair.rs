@@ -3,8 +3,9 @@
 //! Everything of a pair is summed in the frame of scan i as a function of a left perturbation of `i_from_j`; the
 //! derivative by pose i is minus that by pose j carried through the adjoint, so a pair costs one 6x6 matrix, not a 12x12.
 
-use nalgebra::{Cholesky, Matrix3, Matrix6, SymmetricEigen, Vector3, Vector6};
+use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SymmetricEigen, Vector3, Vector6};
 
+use super::dense_sums::Sums;
 use super::twist::{adjoint, quarters, rotation_vector, skew, twist};
 use crate::geometry::{Kernel, Point, Pose};
 
@@ -33,46 +34,17 @@ pub(super) struct PairTerms {
     pub point_information: Matrix6<f64>,
 }
 
-fn vector(point: Point) -> Vector3<f64> {
-    Vector3::from(point).cast()
-}
-
-fn plane_distance(c: &Correspondence, point_in_i: &Vector3<f64>) -> f64 {
-    vector(c.normal_in_i).dot(&(point_in_i - vector(c.point_in_i)))
-}
-
-/// The energy of a pair alone.
-pub(super) fn pair_cost(correspondences: &[Correspondence], i_from_j: &Pose, kernel: Kernel) -> f64 {
-    let terms = correspondences.iter().map(|c| {
-        let r = plane_distance(c, &i_from_j.transform(&vector(c.point_in_j)));
-        f64::from(c.weight) * kernel.rho(r * r)
-    });
-    terms.sum()
-}
-
 impl PairTerms {
     /// Of a pair's correspondences at a relative pose.
     pub(super) fn of(correspondences: &[Correspondence], i_from_j: &Pose, kernel: Kernel) -> Self {
-        let (mut cost, mut information, mut rhs) = (0.0, Matrix6::zeros(), Vector6::zeros());
-        let (mut total, mut first, mut second) = (0.0, Vector3::zeros(), Matrix3::zeros());
-        for c in correspondences {
-            let point = i_from_j.transform(&vector(c.point_in_j));
-            let normal = vector(c.normal_in_i);
-            let r = plane_distance(c, &point);
-            let weight = f64::from(c.weight) * kernel.weight(r * r);
-            cost += f64::from(c.weight) * kernel.rho(r * r);
-            let jacobian = twist(&point.cross(&normal), &normal);
-            let weighted = jacobian * weight;
-            information += weighted * jacobian.transpose();
-            rhs -= weighted * r;
-            total += weight;
-            first += point * weight;
-            second += (point * weight) * point.transpose();
-        }
+        let sums = Sums::of(correspondences, i_from_j, kernel);
+        let information = symmetric::<6>(&sums.information);
+        let second = symmetric::<3>(&sums.second);
         let turn = Matrix3::identity() * second.trace() - second;
+        let first = Vector3::from(sums.first);
         let point_information =
-            quarters(&turn, &skew(&first), &-skew(&first), &(Matrix3::identity() * total));
-        Self { cost, information, rhs, point_information }
+            quarters(&turn, &skew(&first), &-skew(&first), &(Matrix3::identity() * sums.weight));
+        Self { cost: sums.cost, information, rhs: -Vector6::from(sums.gradient), point_information }
     }
 
     /// The same as a function of the left perturbation of pose j in the model frame; that of pose i is its negative.
@@ -86,6 +58,14 @@ impl PairTerms {
             point_information: carried(&self.point_information),
         }
     }
+}
+
+/// A symmetric matrix by its lower triangle, row by row.
+fn symmetric<const N: usize>(triangle: &[f64]) -> SMatrix<f64, N, N> {
+    SMatrix::from_fn(|i, j| {
+        let (row, column) = (i.max(j), i.min(j));
+        triangle[row * (row + 1) / 2 + column]
+    })
 }
 
 /// A share of the point information's diagonal added to it, so that thin sets of points have a factor: far above the
@@ -164,6 +144,7 @@ impl Hold {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::optimize::dense_sums::cost as pair_cost;
     use nalgebra::Rotation3;
 
     /// A grid on each of the given planes through (2, 1, 1), by unit normal.

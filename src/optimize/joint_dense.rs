@@ -15,7 +15,8 @@ pub use options::DenseOptions;
 pub use problem::{Correspondences, DenseError, DenseProblem};
 
 use super::bundle_adjustment::{BundleState, moved};
-use super::dense_pair::{Correspondence, Hold, PairTerms, blind_motions, pair_cost};
+use super::dense_pair::{Correspondence, Hold, PairTerms, blind_motions};
+use super::dense_sums::cost;
 use super::gauge::Gauge;
 use super::landmark_terms::LandmarkTerms;
 use super::levenberg_marquardt::{MinimiseError, Problem, Report, minimise};
@@ -232,7 +233,7 @@ impl Problem for Round<'_> {
         let one = |pair: &RoundPair| {
             let i_from_j = pair.i_from_j(&state.poses);
             let held = pair.hold.map_or(0.0, |hold| hold.cost(&i_from_j));
-            pair_cost(&pair.correspondences, &i_from_j, self.kernel) + held
+            cost(&pair.correspondences, &i_from_j, self.kernel) + held
         };
         let pairs: Vec<f64> = self.pairs.par_iter().map(one).collect();
         pairs.into_iter().sum::<f64>() + self.landmarks.cost(&state.poses, &state.landmarks)

@@ -20,6 +20,7 @@ mod block_system;
 mod bundle_adjustment;
 mod chunks;
 mod dense_pair;
+mod dense_sums;
 mod gauge;
 mod joint_dense;
 mod landmark_terms;
