@@ -97,8 +97,8 @@ pub fn glimpse(
         let groups = tied(keys.len(), others.map(|&(a, b, _)| (a, b, 0.0)));
         let group_of = |scan: usize| groups.iter().find(|group| group.contains(&scan));
         let own = group_of(scan).filter(|own| own.len() >= PIECE)?;
-        let seen = looks(scan).filter(|other| !own.contains(other)).find_map(group_of);
-        let piece = seen.filter(|seen| seen.len() >= PIECE)?;
+        let mut seen = looks(scan).filter(|other| !own.contains(other)).filter_map(group_of);
+        let piece = seen.find(|seen| seen.len() >= PIECE)?;
         Some(smaller_side(component, piece.iter().map(|scan| keys[*scan]).collect()))
     })
 }
@@ -298,6 +298,13 @@ mod tests {
         assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4), (3, 5)]), three);
         assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4)]), None, "one pair shares much");
         assert_eq!(find(&[(3, 4), (2, 5)], &[(3, 4), (2, 5)]), None, "two scans see something");
+        // A lone scan that it sees little of is no piece, and hides none.
+        let lone = glimpse(
+            &component,
+            &[(1, 2), (2, 3), (2, 4), (5, 6), (2, 5)].map(|(a, b)| ((ScanKey(a), ScanKey(b)), 4.0)).into(),
+            &[(2, 4), (2, 5)].map(|(a, b)| (ScanKey(a), ScanKey(b))).into(),
+        );
+        assert_eq!(lone, Some([5, 6].map(ScanKey).into()));
         assert_eq!(
             find(&[(1, 4), (2, 4), (3, 4)], &[(1, 4), (2, 4), (3, 4)]).map(|side| side.len()),
             Some(3)

@@ -49,7 +49,8 @@ const LEAST_SHARING: usize = 6;
 const BLAMED_SHARE: f64 = 0.25;
 /// … and the pair lies in free space by this many times what is usual …
 const STRONG_CONTRAST: f64 = 8.0;
-/// … and this share more: four in seven rooms with a corridor whose ends are seen by one pair, 1.9 %; where halls of moved furniture are right, none.
+/// … and this share more. Of seven identical rooms, the ends of whose corridor only one pair sees, it puts 1.9 % there; in halls of which half the
+/// furniture was moved, no pair denies anything.
 const STRONG_FLOOR: f64 = 0.012;
 
 /// A pair as it stands in the component.

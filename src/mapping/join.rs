@@ -63,7 +63,7 @@ pub enum Refusal {
     },
     /// A client decided the join, and forbade what it would bring together.
     Forbidden,
-    /// Two pieces of several scans each share one pair alone.
+    /// Two pieces of several scans each share one pair alone, or what one scan sees little of.
     SinglePair {
         /// Its support.
         support: f64,

@@ -27,7 +27,7 @@ const FEW_SCANS: usize = 2;
 /// … as long as the rest are this many times as many.
 const REST: usize = 6;
 /// Scans belong where the voice would have them if the same is said for the move, by as much on average: in near-symmetric halls it is 1.2.
-/// Identical rooms come near to that, so it must settle the matter (`undo`). …
+/// Identical rooms come near to that, so it must settle the matter (`finding`). …
 const BETTER_MEAN: f64 = 1.0;
 /// … Where chunks of a warehouse were turned it is 2.0 and more, and as much together as is overwhelming: that is clear, whatever else is said.
 const CLEAR_MEAN: f64 = 1.6;
@@ -174,10 +174,10 @@ impl Move {
         self.lost <= -OVERWHELMING && self.lost <= -least * self.pairs as f64
     }
 
-    /// Whether nearly all pairs between the sides meet before and after.
+    /// Whether both sides are more than a few scans, and nearly all pairs between them can tell: they meet at both places, or would.
     fn maps_the_place_onto_itself(&self) -> bool {
-        let across = self.side(true).len() * self.side(false).len();
-        self.pairs as f64 >= WHOLE_SHARE * across as f64
+        let [moving, staying] = [true, false].map(|moving| self.side(moving).len());
+        moving.min(staying) > FEW_SCANS && self.pairs as f64 >= WHOLE_SHARE * (moving * staying) as f64
     }
 
     /// The few scans on one side, if it is more likely than not that they belong where they are.

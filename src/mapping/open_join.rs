@@ -149,6 +149,9 @@ pub fn open_joins(
                 Refusal::SinglePair { support: best.support }
             } else if best.margin(options) < needed {
                 Refusal::Rival { support: best.support, rival: best.rival }
+            } else if violation <= last.violation {
+                // They were joined, and parted as one scan alone sees little of the other piece.
+                Refusal::SinglePair { support: best.support }
             } else {
                 Refusal::Violation { found: violation, allowed: last.violation }
             }

@@ -4,8 +4,8 @@
 //! a component from an initial pair. Any success goes back to the strictest level, because the model has grown and what waited may
 //! now be well supported. When nothing fits, misplaced scans are filtered and tried again, and retrieval widens for what stays apart.
 //! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. Where
-//! alike places were found, none but those of the strictest level are made from then on, which no single pair passes. Pieces that a single weak pair
-//! turns out to hold together are parted at the end. What is left waits.
+//! alike places were found, none but those of the strictest level are made from then on, which no single pair passes. Pieces that a single weak pair, or one scan that sees little, turns out to hold together
+//! are parted at the end. What is left waits.
 
 use std::collections::BTreeSet;
 

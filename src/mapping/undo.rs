@@ -2,7 +2,7 @@
 //! scans fit the rest clearly better elsewhere, or its sides turn out to stand in each other's free space, that join is undone and its pose is
 //! not tried again; where they are too many for that, and say the same, or where pairs deny what all others make of them, alike places were folded
 //! onto each other: nothing there can be told from its twin, so nothing is kept, and the scans wait until a new scan or a decision changes what
-//! is known.
+//! is known. What one pair alone holds together, and looks like it, waits along.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -20,8 +20,25 @@ use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::graph::ScanGraph;
 
-/// Scans of a component that one pair holds together.
+/// Scans of a component that one pair holds together. Where places are alike, they may be of two of them.
 const PAIR: usize = 2;
+
+/// A component in which alike places were taken for one.
+struct Fold {
+    scans: Vec<ScanKey>,
+    supports: BTreeMap<(ScanKey, ScanKey), f64>,
+    testimony: Testimony,
+    strongest: Contradiction,
+}
+
+impl Fold {
+    /// Whether some pair would have scans of a component beside those that were folded.
+    fn looks_like(&self, graph: &ScanGraph, component: &Component) -> bool {
+        let pairs = component.poses.keys().flat_map(|x| self.scans.iter().map(move |y| (*x, *y)));
+        let mut edges = pairs.filter_map(|(x, y)| graph.edge(x, y));
+        edges.any(|edge| edge.hypotheses.iter().any(|h| h.score.max(h.hypothesis.logit) > 0.0))
+    }
+}
 
 impl Mapper {
     /// Undoes what pairs contradict. Returns the poses that are not to be tried again while the model grows, or `None` if nothing
@@ -38,7 +55,7 @@ impl Mapper {
         let mut sound: Vec<(usize, Component)> = Vec::new();
         // Components of which a part turned out to be folded, with what was said of it: what else they came apart into is of the same alike
         // places.
-        let mut folded: BTreeMap<usize, (Testimony, Contradiction)> = BTreeMap::new();
+        let mut folded: BTreeMap<usize, Fold> = BTreeMap::new();
         let mut bans = None;
         while let Some((origin, mut component)) = pending.pop() {
             control.check()?;
@@ -56,16 +73,17 @@ impl Mapper {
             let asked = self.with_torn(graph, &component, voxel, options);
             let mut testimony = testimony(graph, &asked, options);
             let waits = asked.poses.keys().copied().filter(|scan| !holds(*scan)).collect();
-            testimony.cross_examine(graph, &asked, &waits, options, control)?;
+            testimony.cross_examine(graph, &asked, &waits, true, options, control)?;
             let case =
                 Case { graph, component: &component, supports: &supports, testimony: &testimony, options };
             match case.finding(&asked, &waits, voxel, control)? {
                 Finding::Sound => sound.push((origin, component)),
                 Finding::Folded { strongest } => {
                     bans.get_or_insert_with(Vec::new);
-                    self.undone.push(record(&supports, scans_of(&component), &strongest));
+                    let scans = scans_of(&component);
+                    self.undone.push(record(&supports, scans.clone(), &strongest));
                     self.doubt(component, &testimony);
-                    folded.insert(origin, (testimony, strongest));
+                    folded.insert(origin, Fold { scans, supports, testimony, strongest });
                 }
                 Finding::Torn { side, strongest } => {
                     bans.get_or_insert_with(Vec::new).extend(ban(graph, &component, &supports, &side));
@@ -85,15 +103,13 @@ impl Mapper {
                 }
             }
         }
-        // Where places are alike, what only one pair holds together may be of two of them.
-        let alike = folded.values().next();
         for (origin, component) in sound {
-            let doubted = folded.get(&origin).or(alike.filter(|_| component.len() == PAIR));
-            match doubted {
-                Some((testimony, strongest)) => {
-                    let supports = supports(graph, &component, options);
-                    self.undone.push(record(&supports, scans_of(&component), strongest));
-                    self.doubt(component, testimony);
+            let alike =
+                || folded.values().find(|fold| component.len() == PAIR && fold.looks_like(graph, &component));
+            match folded.get(&origin).or_else(alike) {
+                Some(fold) => {
+                    self.undone.push(record(&fold.supports, scans_of(&component), &fold.strongest));
+                    self.doubt(component, &fold.testimony);
                 }
                 None => self.components.push(component),
             }

@@ -5,22 +5,9 @@
 
 use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SymmetricEigen, Vector3, Vector6};
 
-use super::dense_sums::Sums;
+use super::dense_sums::{Correspondence, Sums};
 use super::twist::{adjoint, quarters, rotation_vector, skew, twist};
-use crate::geometry::{Kernel, Point, Pose};
-
-/// A point of scan j and the surface of scan i it lies near.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Correspondence {
-    /// A point of the surface in the frame of scan i, metres.
-    pub point_in_i: Point,
-    /// Its unit normal in the frame of scan i.
-    pub normal_in_i: Point,
-    /// The point in the frame of scan j, metres.
-    pub point_in_j: Point,
-    /// How much it counts, at least zero.
-    pub weight: f32,
-}
+use crate::geometry::{Kernel, Pose};
 
 /// `sum w rho(r^2)` with `r = n . (x_i(point of j) - point of i)`, linearised.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,10 +1,22 @@
 //! Sums over the correspondences of one pair of scans, eight side by side, in double precision: these are most of what a joint dense adjustment
-//! computes. Used by `dense_pair`, which makes matrices of them.
+//! computes. Used by `dense_pair`, which makes matrices of them, and by `joint_dense`.
 
 use multiversion::multiversion;
 
-use super::dense_pair::Correspondence;
-use crate::geometry::{Kernel, Pose};
+use crate::geometry::{Kernel, Point, Pose};
+
+/// A point of scan j and the surface of scan i it lies near.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Correspondence {
+    /// A point of the surface in the frame of scan i, metres.
+    pub point_in_i: Point,
+    /// Its unit normal in the frame of scan i.
+    pub normal_in_i: Point,
+    /// The point in the frame of scan j, metres.
+    pub point_in_j: Point,
+    /// How much it counts, at least zero.
+    pub weight: f32,
+}
 
 /// Correspondences that are worked on side by side.
 const LANES: usize = 8;

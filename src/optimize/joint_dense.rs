@@ -15,8 +15,8 @@ pub use options::DenseOptions;
 pub use problem::{Correspondences, DenseError, DenseProblem};
 
 use super::bundle_adjustment::{BundleState, moved};
-use super::dense_pair::{Correspondence, Hold, PairTerms, blind_motions};
-use super::dense_sums::cost;
+use super::dense_pair::{Hold, PairTerms, blind_motions};
+use super::dense_sums::{Correspondence, cost};
 use super::gauge::Gauge;
 use super::landmark_terms::LandmarkTerms;
 use super::levenberg_marquardt::{MinimiseError, Problem, Report, minimise};

@@ -38,7 +38,7 @@ pub use averaging::{Averaged, AveragingError, AveragingOptions};
 pub use block_solver::{BlockSolver, BlockSolverError};
 pub use block_system::BlockSystem;
 pub use bundle_adjustment::{BundleAdjustment, BundleError, BundleOptions, adjust_bundle};
-pub use dense_pair::Correspondence;
+pub use dense_sums::Correspondence;
 pub use joint_dense::{
     Correspondences, DenseAdjustment, DenseError, DenseOptions, DenseProblem, DenseRound, adjust_dense,
 };

@@ -26,7 +26,7 @@ pub struct BuildingOptions {
     pub room_size: [f32; 2],
     /// How much stands in the rooms: 0 is empty, 1 is usual, 2 is packed.
     pub density: f32,
-    /// Share of the furniture that stands elsewhere at a second visit, 0 to 1.
+    /// Share of the furniture that stands elsewhere at a second visit, 0 to 1. Stations are chosen by what they see at the first.
     pub moved: f32,
     /// What makes scans disagree about free space.
     pub hazards: Hazards,

@@ -70,7 +70,7 @@ impl Survey {
             let ray = Ray { origin: eye, direction: rotation * (point / distance.max(1e-6)) };
             index_of_by.around(&point).next().is_some()
                 && building
-                    .scene
+                    .scene_at(by.visit)
                     .cast(&ray, 0.0, distance - SLACK)
                     .is_none_or(|hit| hit.material == Material::Glass)
         };
@@ -145,5 +145,16 @@ mod tests {
             }
         }
         assert!(apart > 0, "no pair is only near through a wall");
+    }
+
+    #[test]
+    fn a_scan_shares_all_with_itself_at_any_visit() {
+        let building = BuildingOptions { rooms: 2, moved: 1.0, ..Default::default() };
+        let sensor = Sensor::panoramic(6000);
+        let options = SurveyOptions { building, sensor, stations: 6, seed: Seed(4), ..Default::default() };
+        let seen = simulate(&options).unwrap().shared_views(0.25);
+        for (i, row) in seen.iter().enumerate() {
+            assert!(row[i] > 0.95, "scan {i} shares {} with itself", row[i]);
+        }
     }
 }
