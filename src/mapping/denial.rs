@@ -123,10 +123,10 @@ impl Denials {
         Self { denying, sharing, scans: component.len() }
     }
 
-    /// Whether no pair denies anything.
+    /// Whether no pair denies anything, although every scan shares much with another that could.
     #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.denying.is_empty()
+    pub fn nobody_denies(&self) -> bool {
+        self.denying.is_empty() && self.sharing.len() == self.scans
     }
 
     /// The surest of the pairs that show that alike places were taken for one, if any do.
@@ -265,6 +265,12 @@ mod tests {
             let pose = moved.poses.get_mut(&ScanKey(scan)).expect("a scan of the hall");
             *pose = Pose::from_translation(nalgebra::Vector3::x() * 30.0) * *pose;
         }
-        assert!(Denials::of(&graph, &moved, &options).is_empty());
+        let denials = Denials::of(&graph, &moved, &options);
+        assert!(
+            denials.shown().is_none() && !denials.nobody_denies(),
+            "nobody was asked about scans 1 and 3"
+        );
+        let sound = model.graph_where(&[], 600, 0.1);
+        assert!(Denials::of(&sound, &model.component, &options).nobody_denies());
     }
 }

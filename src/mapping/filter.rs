@@ -19,8 +19,8 @@ const FILTER_FROM: usize = 4;
 const FILTER_MARGIN: f64 = 2.0;
 
 impl Mapper {
-    /// Filtering: takes out scans that have clearly more support at another pose than at their own, in their component or in another. They wait,
-    /// and may register again. Returns how many.
+    /// Filtering: takes out scans that have clearly more support at another pose than at their own; they wait, and may register again. Those that
+    /// nothing firm holds and that have clearly more support in another component are taken out, too, and set aside. Returns how many.
     pub fn filter_scans(
         &mut self,
         graph: &ScanGraph,
@@ -29,6 +29,7 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<usize, Cancelled> {
         let mut misplaced: Vec<ScanKey> = Vec::new();
+        let mut torn: Vec<ScanKey> = Vec::new();
         for (index, component) in self.components.iter().enumerate().filter(|(_, c)| c.len() >= FILTER_FROM) {
             // Poses are all that is asked of the rest.
             let mut rest = Component {
@@ -60,8 +61,11 @@ impl Mapper {
                         others.filter_map(|(_, other)| best_candidate(graph, other, &single, voxel, options));
                     bests.any(|best| better(&best))
                 };
-                if elsewhere || (!held && in_another()) {
+                if elsewhere {
                     misplaced.push(*scan);
+                } else if !held && own < options.firm_support && in_another() {
+                    misplaced.push(*scan);
+                    torn.push(*scan);
                 }
             }
         }
@@ -72,6 +76,8 @@ impl Mapper {
             }
             self.add_waiting(*scan);
         }
+        // Places that look alike, such as the ends of a hall, pull at them from both sides: it is open where they belong.
+        self.set_aside.extend(torn);
         self.dissolve_small();
         Ok(misplaced.len())
     }
@@ -119,6 +125,7 @@ mod tests {
             let mut mapper = Mapper { components, ..Mapper::default() };
             let count = mapper.filter_scans(graph, model.hall.resolution, options, control);
             assert_eq!(count, Ok(mapper.waiting.len()));
+            assert!(mapper.waiting.keys().all(|scan| mapper.set_aside.contains(scan)));
             mapper.waiting.into_keys().collect::<Vec<_>>()
         };
         assert_eq!(filtered(&graph, &options), [], "both know it");

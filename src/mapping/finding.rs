@@ -147,8 +147,7 @@ impl Case<'_> {
         let poses = asked.poses.iter().map(moved).collect();
         let there = Component { gauge: asked.gauge, poses, tracks: Tracks::default() };
         let mut testimony = testimony(self.graph, &there, self.options);
-        // Nobody has looked at the pairs between the sides there, so that nobody denies them says nothing.
-        testimony.cross_examine(self.graph, &there, waits, false, self.options, control)?;
+        testimony.cross_examine(self.graph, &there, waits, self.options, control)?;
         Ok(!testimony.condemns())
     }
 

@@ -69,13 +69,11 @@ impl Testimony {
     /// Asks the pairs that contradict again, with a second look, if several speak with the voice that weighs most. A pair whose scans fit
     /// clearly better where they are than where it would have them is no witness. What is still said with so much weight that the component
     /// could not stand is given a hearing, voice by voice, and ignored where it is refuted. Of the component's scans, `waits` only stand in it.
-    /// Where pairs have looked at the poses that their scans have (`stands`), it also counts for them that nobody denies them.
     pub fn cross_examine(
         &mut self,
         graph: &ScanGraph,
         component: &Component,
         waits: &BTreeSet<ScanKey>,
-        stands: bool,
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
@@ -99,7 +97,7 @@ impl Testimony {
             let words = Word::both_ways(graph, component, &self.contradictions, options);
             let voice = loudest(&words, options.rival_angle);
             if hearing.is_none() {
-                let undenied = stands && Denials::of(graph, component, options).is_empty();
+                let undenied = Denials::of(graph, component, options).nobody_denies();
                 hearing = Some(Hearing::open(graph, component, control)?.asking_less(undenied));
             }
             let ruling = match &hearing {

@@ -73,7 +73,7 @@ impl Mapper {
             let asked = self.with_torn(graph, &component, voxel, options);
             let mut testimony = testimony(graph, &asked, options);
             let waits = asked.poses.keys().copied().filter(|scan| !holds(*scan)).collect();
-            testimony.cross_examine(graph, &asked, &waits, true, options, control)?;
+            testimony.cross_examine(graph, &asked, &waits, options, control)?;
             let case =
                 Case { graph, component: &component, supports: &supports, testimony: &testimony, options };
             match case.finding(&asked, &waits, voxel, control)? {
