@@ -1,6 +1,7 @@
 //! The scan graph: which pairs were tried (retrieval), what they found (edges with several hypotheses each), and how third
-//! scans support or contradict each hypothesis. Uses `pairwise`; used by `mapping`.
+//! scans and the frequency of right poses support or contradict each hypothesis. Uses `pairwise`; used by `mapping`.
 
+mod base_rate;
 mod centrality;
 mod memo;
 mod retrieval;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::base_rate::correction;
 use super::memo::Memo;
 use super::support::{SupportOptions, support};
 use crate::cloud::ScanKey;
@@ -23,7 +24,7 @@ pub struct Supported {
     pub hypothesis: Hypothesis,
     /// Sum over third scans of the likelihood of the best path that agrees with it.
     pub support: f64,
-    /// Log-odds that the pose is right, with triplets.
+    /// Log-odds that the pose is right, with triplets, and as rare as right poses are in the project.
     pub score: f64,
 }
 
@@ -78,6 +79,7 @@ pub struct ScanGraph {
     edges: BTreeMap<PairKey, Edge>,
     neighbors: BTreeMap<ScanKey, BTreeSet<ScanKey>>,
     probes: Memo<Probe>,
+    correction: f64,
 }
 
 impl ScanGraph {
@@ -119,6 +121,12 @@ impl ScanGraph {
     #[must_use]
     pub fn scan(&self, key: ScanKey) -> Option<&Arc<Scan>> {
         self.scans.get(&key)
+    }
+
+    /// What the log-odds of all hypotheses are raised by for how rare right ones are here; zero or less.
+    #[must_use]
+    pub const fn correction(&self) -> f64 {
+        self.correction
     }
 
     /// All edges.
@@ -234,7 +242,18 @@ impl ScanGraph {
         pairs
     }
 
+    /// Renews the support of these edges; of all, if what they are worth together has changed.
     fn refresh_support(&mut self, stale: &[PairKey], options: &SupportOptions) {
+        let correction = correction(self.edges.values(), options.verifier.share_of_right());
+        if correction == self.correction {
+            self.renew_support(stale, options);
+        } else {
+            self.correction = correction;
+            self.renew_support(&self.edges.keys().copied().collect::<Vec<_>>(), options);
+        }
+    }
+
+    fn renew_support(&mut self, stale: &[PairKey], options: &SupportOptions) {
         let fresh: Vec<(PairKey, Vec<(f64, f64)>)> = stale
             .par_iter()
             .filter_map(|pair| Some((*pair, support(self, self.edges.get(pair)?, options))))

@@ -55,7 +55,7 @@ pub(super) fn support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) 
     (0..edge.hypotheses.len())
         .map(|h| {
             let features = features_of(graph, edge, &supports, h, options);
-            (supports[h].agreeing, options.verifier.triplet.logit(&features))
+            (supports[h].agreeing, options.verifier.triplet.logit(&features) + graph.correction())
         })
         .collect()
 }
@@ -95,8 +95,8 @@ fn features_of(
     [me.logit, log(supports[h].agreeing), rival.0, rival.1, log(supports[h].opposing)]
 }
 
-fn likelihood(h: &Supported) -> f64 {
-    1.0 / (1.0 + (-h.hypothesis.logit).exp())
+fn likelihood(h: &Supported, correction: f64) -> f64 {
+    1.0 / (1.0 + (-h.hypothesis.logit - correction).exp())
 }
 
 fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<Paths> {
@@ -104,11 +104,12 @@ fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec
     let mut supports = vec![Paths::default(); edge.hypotheses.len()];
     let Some(scan_b) = graph.scan(b) else { return supports };
     let reach = options.agree_voxels * scan_b.prepared.resolution;
+    let correction = graph.correction();
     for k in graph.neighbors(a).filter(|k| *k != b) {
         let (Some(first), Some(second)) = (graph.edge(a, k), graph.edge(k, b)) else { continue };
         let legs = |edge: &Edge, from| -> Vec<(Pose, f64)> {
             edge.motions_from(from)
-                .map(|(motion, h)| (motion, likelihood(h)))
+                .map(|(motion, h)| (motion, likelihood(h, correction)))
                 .filter(|(_, p)| *p > options.least_likelihood)
                 .collect()
         };

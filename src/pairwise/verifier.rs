@@ -201,6 +201,21 @@ pub enum VerifierError {
 }
 
 impl Verifier {
+    /// The share of the hypotheses that were right where the regressions were fitted, scenes weighted as for the fit: by the root of what they
+    /// have. `None` if that is not known.
+    #[must_use]
+    pub fn share_of_right(&self) -> Option<f64> {
+        let (mut right, mut all) = (0.0, 0.0);
+        for scene in &self.provenance.scenes {
+            let count = scene.right as f64 + scene.wrong as f64;
+            if count > 0.0 {
+                right += scene.right as f64 / count.sqrt();
+                all += count.sqrt();
+            }
+        }
+        (all > 0.0).then(|| right / all)
+    }
+
     /// Reads a verifier from JSON, the form in which it is serialised.
     pub fn parse(json: &str) -> Result<Self, VerifierError> {
         let verifier: Self = serde_json::from_str(json)?;
