@@ -8,7 +8,7 @@
 use super::scan_graph::Edge;
 
 /// Hypotheses of the fitted share that a project is taken to have beside its own: few pairs tell little.
-const IMAGINED: f64 = 560.0;
+const IMAGINED: f64 = 100.0;
 /// Rounds of expectation maximisation. It gains a factor in each and has long settled by then.
 const ROUNDS: usize = 50;
 /// The correction is a multiple of this, so that one more scan seldom changes what all pairs are worth.
