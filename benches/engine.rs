@@ -95,7 +95,7 @@ fn surface_normals(c: &mut Criterion) {
     let fine = voxel_centroids(&f.clouds[0].points, voxel / 2.0);
     let coarse = voxel_centroids(&fine, voxel);
     let index = NeighborIndex::new(&fine, 2.0 * voxel);
-    c.bench_function("normals", |b| b.iter(|| normals(black_box(&coarse), &fine, &index, 2.0 * voxel)));
+    c.bench_function("normals", |b| b.iter(|| normals(black_box(&coarse), &index, 2.0 * voxel)));
 }
 
 /// Bound by arithmetic: about 100 neighbours a point, each found by its distance, each with three angles, and each adding a histogram of 33

@@ -19,19 +19,15 @@ pub type Descriptor = [f32; DESCRIPTOR_LEN];
 #[must_use]
 pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor> {
     let index = NeighborIndex::new(points, radius);
-    let neighborhoods: Vec<Vec<(u32, f32)>> = points
-        .par_iter()
-        .enumerate()
-        .map(|(me, point)| {
-            let mut near = Vec::with_capacity(128);
-            index.within(point, radius, |other, square| {
-                if other != me && square > 0.0 {
-                    near.push((other as u32, square));
-                }
-            });
-            near
-        })
-        .collect();
+    let neighborhoods: Vec<Vec<(u32, f32)>> = index.map(points, radius, |me, around| {
+        let mut near = Vec::with_capacity(128);
+        around.within(&points[me], |other, square| {
+            if other != me && square > 0.0 {
+                near.push((other as u32, square));
+            }
+        });
+        near
+    });
     let simple: Vec<Descriptor> = neighborhoods
         .par_iter()
         .enumerate()

@@ -244,7 +244,7 @@ pub fn prepare(
         return Err(PrepareError::TooManyPoints { found: coarse.len(), limit: MAX_POINTS, resolution });
     }
     let reach = NORMAL_RADIUS * v;
-    let raw_normals = normals(&coarse, &fine, &NeighborIndex::new(&fine, reach), reach);
+    let raw_normals = normals(&coarse, &NeighborIndex::new(&fine, reach), reach);
     control.check()?;
 
     let frame_origin = cloud.origin.map(|x| -x as f32);
@@ -307,7 +307,7 @@ fn fine_surface(cloud: &PointCloud, viewpoint: &Point, fine: &[Point], v: f32) -
     // As for the scan itself, what is half as large again carries the normals and the range image.
     let finer = voxel_centroids(&cloud.points, v / 4.0);
     let reach = NORMAL_RADIUS * v / 2.0;
-    let normals = normals(fine, &finer, &NeighborIndex::new(&finer, reach), reach);
+    let normals = normals(fine, &NeighborIndex::new(&finer, reach), reach);
     let (points, normals): (Vec<Point>, Vec<Point>) = fine
         .iter()
         .zip(normals)

@@ -150,7 +150,7 @@ mod tests {
 
     fn seen(points: &[Point], sensor: SensorPosition, origin: Point) -> Viewpoint {
         let samples = voxel_centroids(points, 0.004);
-        let normals = normals(&samples, points, &NeighborIndex::new(points, 0.008), 0.008);
+        let normals = normals(&samples, &NeighborIndex::new(points, 0.008), 0.008);
         let surfaces =
             Surfaces { points, samples: &samples, normals: &normals, resolution: 0.004, extent: 0.28 };
         viewpoint(&surfaces, sensor, origin)

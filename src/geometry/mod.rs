@@ -12,13 +12,15 @@ mod pose;
 pub mod pose_text;
 mod rigid_fit;
 mod robust;
+mod spread;
 mod voxel_grid;
 
 pub use nearest_grid::NearestGrid;
-pub use neighbors::NeighborIndex;
+pub use neighbors::{Moments, NeighborIndex, Surroundings};
 pub use pose::{Pose, PoseError};
 pub use rigid_fit::rigid_fit;
 pub use robust::Kernel;
+pub use spread::Spread;
 pub use voxel_grid::{cell_of, occupied_voxels, voxel_centroids, voxel_groups};
 
 /// A point or direction in single precision, local to its scan. Metres.

@@ -2,15 +2,20 @@
 //!
 //! Points lie sorted by the cells of a regular grid about as wide as the radius asked for, one array a coordinate: the cells around a query
 //! are then a few runs of points, whose distances are computed many at once. For neighbourhoods of tens of points this is
-//! several times faster than a kd-tree, which takes a branch for every few points.
+//! several times faster than a kd-tree, which takes a branch for every few points. Queries of one cell have their runs in common.
+
+use std::ops::Range;
 
 use multiversion::multiversion;
+use rayon::prelude::*;
 
 use super::Point;
 use super::voxel_grid::{cell_of, sorted_by_cell};
 
 /// Points of a run that are looked at together.
 const BLOCK: usize = 64;
+/// Points whose moments are summed side by side.
+const LANES: usize = 16;
 
 /// The points of one scan, sorted for lookups.
 pub struct NeighborIndex {
@@ -21,6 +26,25 @@ pub struct NeighborIndex {
     position: [Vec<f32>; 3],
     /// Which point each is.
     item: Vec<u32>,
+}
+
+/// Sums over the neighbours of a place: of their offsets from it (metres) and of the products of these (square metres).
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Moments {
+    /// How many there are.
+    pub count: usize,
+    /// Sums of x, y, z.
+    pub sum: [f64; 3],
+    /// Sums of xx, xy, xz, yy, yz, zz.
+    pub products: [f64; 6],
+}
+
+/// The points around the queries of one cell.
+pub struct Surroundings<'i> {
+    index: &'i NeighborIndex,
+    runs: Vec<Range<usize>>,
+    /// Metres.
+    radius: f32,
 }
 
 impl NeighborIndex {
@@ -47,38 +71,132 @@ impl NeighborIndex {
 
     /// Calls `visit(index, squared distance in m^2)` for every point nearer than `radius` metres, in an order that depends
     /// only on the indexed points and the query. The time grows with the square of `radius` over the index's reach.
-    pub fn within(&self, point: &Point, radius: f32, mut visit: impl FnMut(usize, f32)) {
-        let low = cell_of(&point.map(|x| x - radius), self.size);
-        let high = cell_of(&point.map(|x| x + radius), self.size);
-        let limit = radius * radius;
-        let mut square = [0.0_f32; BLOCK];
-        let mut near = [0_usize; BLOCK];
+    pub fn within(&self, point: &Point, radius: f32, visit: impl FnMut(usize, f32)) {
+        self.around([point], radius).within(point, visit);
+    }
+
+    /// The moments of the points nearer than `radius` metres.
+    #[must_use]
+    pub fn moments(&self, point: &Point, radius: f32) -> Moments {
+        self.around([point], radius).moments(point)
+    }
+
+    /// What `answer(number of the query, points around it)` says of each query, in their order. Faster than one lookup for each, as
+    /// those that lie near each other share one.
+    pub fn map<T: Send>(
+        &self,
+        queries: &[Point],
+        radius: f32,
+        answer: impl Fn(usize, &Surroundings<'_>) -> T + Sync,
+    ) -> Vec<T> {
+        let order = sorted_by_cell(queries, self.size);
+        let groups: Vec<&[([i64; 3], u32)]> = order.chunk_by(|a, b| a.0 == b.0).collect();
+        let answered: Vec<Vec<(u32, T)>> = groups
+            .par_iter()
+            .map(|group| {
+                let around = self.around(group.iter().map(|(_, query)| &queries[*query as usize]), radius);
+                group.iter().map(|(_, query)| (*query, answer(*query as usize, &around))).collect()
+            })
+            .collect();
+        let mut answers: Vec<(u32, T)> = answered.into_iter().flatten().collect();
+        answers.sort_unstable_by_key(|(query, _)| *query);
+        answers.into_iter().map(|(_, answer)| answer).collect()
+    }
+
+    /// The points in the cells that `radius` metres around any of these places touch.
+    fn around<'p>(&self, places: impl IntoIterator<Item = &'p Point>, radius: f32) -> Surroundings<'_> {
+        let (mut low, mut high) = ([i64::MAX; 3], [i64::MIN; 3]);
+        for place in places {
+            let (from, to) = (
+                cell_of(&place.map(|x| x - radius), self.size),
+                cell_of(&place.map(|x| x + radius), self.size),
+            );
+            for k in 0..3 {
+                low[k] = low[k].min(from[k]);
+                high[k] = high[k].max(to[k]);
+            }
+        }
+        let mut runs = Vec::with_capacity(9);
         for x in low[0]..=high[0] {
             for y in low[1]..=high[1] {
                 // Cells that differ in z alone follow each other.
                 let first = self.cells.partition_point(|(cell, _)| *cell < [x, y, low[2]]);
                 let after = &self.cells[first..];
                 let count = after.iter().take_while(|(cell, _)| *cell <= [x, y, high[2]]).count();
-                if count == 0 {
-                    continue;
+                if count > 0 {
+                    runs.push(after[0].1..after.get(count).map_or(self.item.len(), |(_, begin)| *begin));
                 }
-                let end = after.get(count).map_or(self.item.len(), |(_, begin)| *begin);
-                for begin in (after[0].1..end).step_by(BLOCK) {
-                    let run = begin..end.min(begin + BLOCK);
-                    let [xs, ys, zs] = self.position.each_ref().map(|axis| &axis[run.clone()]);
-                    squares(xs, ys, zs, point, &mut square);
-                    let mut len = 0;
-                    for i in 0..run.len() {
-                        near[len] = i;
-                        len += usize::from(square[i] < limit);
-                    }
-                    for &i in &near[..len] {
-                        visit(self.item[begin + i] as usize, square[i]);
-                    }
+            }
+        }
+        Surroundings { index: self, runs, radius }
+    }
+}
+
+impl Surroundings<'_> {
+    /// Calls `visit(index, squared distance in m^2)` for every point in the radius of one of the queries that these surroundings are of.
+    pub fn within(&self, point: &Point, mut visit: impl FnMut(usize, f32)) {
+        let limit = self.radius * self.radius;
+        let mut square = [0.0_f32; BLOCK];
+        let mut near = [0_usize; BLOCK];
+        for all in &self.runs {
+            for begin in all.clone().step_by(BLOCK) {
+                let run = begin..all.end.min(begin + BLOCK);
+                let [xs, ys, zs] = self.index.position.each_ref().map(|axis| &axis[run.clone()]);
+                squares(xs, ys, zs, point, &mut square);
+                let mut len = 0;
+                for i in 0..run.len() {
+                    near[len] = i;
+                    len += usize::from(square[i] < limit);
+                }
+                for &i in &near[..len] {
+                    visit(self.index.item[begin + i] as usize, square[i]);
                 }
             }
         }
     }
+
+    /// The moments of the points in the radius of one of the queries that these surroundings are of.
+    #[must_use]
+    pub fn moments(&self, point: &Point) -> Moments {
+        let mut lanes = [[0.0_f32; LANES]; 10];
+        for run in &self.runs {
+            let [xs, ys, zs] = self.index.position.each_ref().map(|axis| &axis[run.clone()]);
+            add_moments(xs, ys, zs, point, self.radius * self.radius, &mut lanes);
+        }
+        let total = |k: usize| lanes[k].iter().map(|x| f64::from(*x)).sum::<f64>();
+        Moments {
+            count: total(0) as usize,
+            sum: std::array::from_fn(|k| total(1 + k)),
+            products: std::array::from_fn(|k| total(4 + k)),
+        }
+    }
+}
+
+/// Adds the points of a run whose squared distance is below `limit` to the count, the three sums and the six products, lane by lane.
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn add_moments(x: &[f32], y: &[f32], z: &[f32], point: &Point, limit: f32, lanes: &mut [[f32; LANES]; 10]) {
+    let n = x.len().min(y.len()).min(z.len());
+    let mut sums = *lanes;
+    for begin in (0..n).step_by(LANES) {
+        // What is missing in the last block is far away.
+        let mut block = [[f32::INFINITY; LANES]; 3];
+        for (block, axis) in block.iter_mut().zip([x, y, z]) {
+            match axis.get(begin..begin + LANES) {
+                Some(whole) => block.copy_from_slice(whole),
+                None => block[..n - begin].copy_from_slice(&axis[begin..n]),
+            }
+        }
+        for k in 0..LANES {
+            let [dx, dy, dz] = [block[0][k] - point[0], block[1][k] - point[1], block[2][k] - point[2]];
+            let near = dx * dx + dy * dy + dz * dz < limit;
+            let [dx, dy, dz, one] = [dx, dy, dz, 1.0].map(|v| if near { v } else { 0.0 });
+            let terms = [one, dx, dy, dz, dx * dx, dx * dy, dx * dz, dy * dy, dy * dz, dz * dz];
+            for (sum, term) in sums.iter_mut().zip(terms) {
+                sum[k] += term;
+            }
+        }
+    }
+    *lanes = sums;
 }
 
 /// Squared distances of a run of points from one.
@@ -108,14 +226,45 @@ mod tests {
         ) {
             let points: Vec<Point> = cells.iter().map(|c| c.map(|x| x as f32)).collect();
             let square = |p: &Point| (0..3).map(|k| (p[k] - query[k]).powi(2)).sum::<f32>();
+            let index = NeighborIndex::new(&points, reach);
             let mut found = Vec::new();
-            NeighborIndex::new(&points, reach).within(&query, radius, |i, _| found.push(i));
+            index.within(&query, radius, |i, _| found.push(i));
+            let moments = index.moments(&query, radius);
+            prop_assert_eq!(moments.count, found.len());
+            let offset = |i: usize, k: usize| f64::from(points[i][k]) - f64::from(query[k]);
+            for (at, (k, l)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].into_iter().enumerate() {
+                let sum: f64 = found.iter().map(|i| offset(*i, k)).sum();
+                let product: f64 = found.iter().map(|i| offset(*i, k) * offset(*i, l)).sum();
+                prop_assert!((moments.sum[k] - sum).abs() < 1e-3);
+                prop_assert!((moments.products[at] - product).abs() < 2e-3, "{} of {product}", moments.products[at]);
+            }
             found.sort_unstable();
             let clear = |i: &usize| (square(&points[*i]).sqrt() - radius).abs() > 1e-4;
             let expected: Vec<usize> =
                 (0..points.len()).filter(|&i| square(&points[i]) < radius * radius).filter(clear).collect();
             found.retain(clear);
             prop_assert_eq!(found, expected);
+        }
+    }
+
+    #[test]
+    fn queries_are_answered_together_as_one_by_one() {
+        let point =
+            |i: usize| [(i * 37 % 101) as f32 * 0.1, (i * 53 % 97) as f32 * 0.1, (i * 71 % 13) as f32];
+        let points: Vec<Point> = (0..600).map(point).collect();
+        let queries: Vec<Point> = (600..900).map(point).map(|p| p.map(|x| x - 0.3)).collect();
+        let index = NeighborIndex::new(&points, 1.0);
+        let together = index.map(&queries, 1.2, |query, around| {
+            let mut found = Vec::new();
+            around.within(&queries[query], |i, square| found.push((i, square.to_bits())));
+            (query, around.moments(&queries[query]), found)
+        });
+        assert_eq!(together.len(), queries.len());
+        for (query, (number, moments, found)) in together.into_iter().enumerate() {
+            let mut alone = Vec::new();
+            index.within(&queries[query], 1.2, |i, square| alone.push((i, square.to_bits())));
+            assert_eq!((number, found), (query, alone));
+            assert_eq!(moments.count, index.moments(&queries[query], 1.2).count);
         }
     }
 

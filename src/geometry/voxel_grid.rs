@@ -5,7 +5,12 @@ use super::Point;
 /// The cell of a point in a grid of `size` metres anchored at the frame's origin.
 #[must_use]
 pub fn cell_of(point: &Point, size: f32) -> [i64; 3] {
-    point.map(|x| (f64::from(x) / f64::from(size)).floor() as i64)
+    point.map(|x| {
+        let cells = f64::from(x) / f64::from(size);
+        // The floor; what stands for it in the least processor's instructions is a call.
+        let toward_zero = cells as i64;
+        toward_zero.saturating_sub(i64::from(toward_zero as f64 > cells))
+    })
 }
 
 /// Groups points by voxel: the indices of each occupied voxel's points, voxels in lexicographic order of their cells, points in
@@ -43,19 +48,17 @@ pub fn occupied_voxels(points: &[Point], size: f32) -> usize {
 /// The points (by number) with their cells, sorted by both.
 pub(super) fn sorted_by_cell(points: &[Point], size: f32) -> Vec<([i64; 3], u32)> {
     let cells: Vec<[i64; 3]> = points.iter().map(|point| cell_of(point, size)).collect();
-    if let Some(keys) = short_keys(&cells) {
-        // The point's number is in the low half of its key.
-        return keys.into_iter().map(|key| (cells[key as u32 as usize], key as u32)).collect();
+    if let Some(numbers) = sorted_by_key(&cells) {
+        return numbers.into_iter().map(|number| (cells[number as usize], number)).collect();
     }
     let mut order: Vec<_> = cells.into_iter().zip(0..).collect();
     order.sort_unstable();
     order
 }
 
-/// Cells and numbers of all points, sorted, as one number each, which compares without a branch. `None` if the points spread over
-/// too many cells along an axis.
-fn short_keys(cells: &[[i64; 3]]) -> Option<Vec<u128>> {
-    const AXIS_BITS: u32 = 32;
+/// The numbers of the points sorted by cell and number, by one key each that holds both and compares without a branch. `None` if the points
+/// spread over too many cells for that.
+fn sorted_by_key(cells: &[[i64; 3]]) -> Option<Vec<u32>> {
     let mut low = *cells.first()?;
     let mut high = low;
     for cell in cells {
@@ -64,19 +67,30 @@ fn short_keys(cells: &[[i64; 3]]) -> Option<Vec<u128>> {
             high[k] = high[k].max(cell[k]);
         }
     }
-    if (0..3).any(|k| high[k].checked_sub(low[k]).is_none_or(|span| span >> AXIS_BITS != 0)) {
-        return None;
+    let bits = |most: u64| u64::BITS - most.leading_zeros();
+    let number_bits = bits(cells.len() as u64);
+    let mut axis_bits = [0; 3];
+    for k in 0..3 {
+        axis_bits[k] = bits(high[k].checked_sub(low[k])? as u64);
     }
-    let mut keys: Vec<u128> = cells
-        .iter()
-        .zip(0_u32..)
-        .map(|(cell, number)| {
-            let axes = (0..3).fold(0, |key, k| (key << AXIS_BITS) | (cell[k] - low[k]) as u128);
-            (axes << 32) | u128::from(number)
-        })
-        .collect();
-    keys.sort_unstable();
-    Some(keys)
+    let key = |cell: &[i64; 3], number: u32| {
+        let axes = (0..3).fold(0, |key: u128, k| (key << axis_bits[k]) | (cell[k] - low[k]) as u128);
+        (axes << number_bits) | u128::from(number)
+    };
+    let keyed = cells.iter().zip(0_u32..);
+    match axis_bits.iter().sum::<u32>() + number_bits {
+        ..=64 => {
+            let mut keys: Vec<u64> = keyed.map(|(cell, number)| key(cell, number) as u64).collect();
+            keys.sort_unstable();
+            Some(keys.into_iter().map(|key| (key & ((1 << number_bits) - 1)) as u32).collect())
+        }
+        65..=128 => {
+            let mut keys: Vec<u128> = keyed.map(|(cell, number)| key(cell, number)).collect();
+            keys.sort_unstable();
+            Some(keys.into_iter().map(|key| (key & ((1 << number_bits) - 1)) as u32).collect())
+        }
+        _ => None,
+    }
 }
 
 #[cfg(test)]
@@ -93,8 +107,19 @@ mod tests {
         assert_eq!(occupied_voxels(&points, 0.5), 2);
         assert_eq!(voxel_groups(&points, 0.5), vec![vec![2], vec![0, 1]]);
 
-        // A point so far away that the short way to sort does not reach it.
-        let far = [points[0], [3e9, 0.0, 0.0], points[1], points[2]];
-        assert_eq!(voxel_groups(&far, 0.5), vec![vec![3], vec![0, 2], vec![1]]);
+        // Points so far away that the shorter keys do not reach them, nor any.
+        for distance in [3e9, 9e17] {
+            let far = [points[0], [distance; 3], points[1], points[2]];
+            assert_eq!(voxel_groups(&far, 0.5), vec![vec![3], vec![0, 2], vec![1]]);
+        }
+        let everywhere = [points[0], [f32::MAX; 3], points[1], points[2], [f32::MIN; 3]];
+        assert_eq!(voxel_groups(&everywhere, 0.5), vec![vec![4], vec![3], vec![0, 2], vec![1]]);
+    }
+
+    #[test]
+    fn a_cell_reaches_from_its_floor_to_the_next() {
+        assert_eq!(cell_of(&[-0.5, 0.0, 0.5], 0.5), [-1, 0, 1]);
+        assert_eq!(cell_of(&[-0.51, -0.01, 0.49], 0.5), [-2, -1, 0]);
+        assert_eq!(cell_of(&[f32::NEG_INFINITY, f32::INFINITY, f32::NAN], 0.5), [i64::MIN, i64::MAX, 0]);
     }
 }
