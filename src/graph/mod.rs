@@ -3,6 +3,7 @@
 
 mod base_rate;
 mod centrality;
+mod cohort;
 mod memo;
 mod retrieval;
 mod scan_graph;

@@ -6,8 +6,9 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::base_rate::correction;
+use super::cohort::Cohorts;
 use super::memo::Memo;
-use super::support::{SupportOptions, support};
+use super::support::{Corrections, SupportOptions, support};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control, Stage};
 use crate::features::Scan;
@@ -28,6 +29,9 @@ pub struct Supported {
     pub score: f64,
 }
 
+/// Corrections are multiples of this, so that one more scan seldom changes what all pairs are worth.
+const STEP: f64 = 0.25;
+
 /// A tried pair.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Edge {
@@ -37,6 +41,10 @@ pub struct Edge {
     pub matches: Vec<(u16, u16)>,
     /// Different poses, the best score first.
     pub hypotheses: Vec<Supported>,
+    /// The best score if nothing is corrected.
+    pub(super) plain_score: f64,
+    /// What its log-odds are raised by for how rare right poses are in the graph, and how alike the places that its scans see.
+    pub(super) correction: f64,
 }
 
 impl Edge {
@@ -209,14 +217,21 @@ impl ScanGraph {
                 .into_iter()
                 .map(|hypothesis| Supported { hypothesis, support: 0.0, score: hypothesis.logit })
                 .collect();
-            self.edges.insert(result.pair, Edge { pair: result.pair, matches: result.matches, hypotheses });
+            let PairResult { pair, matches, .. } = result;
+            let edge = Edge { pair, matches, hypotheses, plain_score: f64::NEG_INFINITY, correction: 0.0 };
+            self.edges.insert(pair, edge);
             self.neighbors.entry(a).or_default().insert(b);
             self.neighbors.entry(b).or_default().insert(a);
             touched.insert(result.pair);
         }
-        // A new edge (a, b) is one side of the triangles (a, b, k): it changes its own support and that of (a, k) and (b, k).
-        let mut stale = touched.clone();
-        for pair in &touched {
+        self.refresh_support(&self.with_triangles(touched), options);
+    }
+
+    /// These edges and those whose support they change: an edge (a, b) is one side of the triangles (a, b, k), so beside its own it changes
+    /// that of (a, k) and (b, k).
+    fn with_triangles(&self, changed: BTreeSet<PairKey>) -> BTreeSet<PairKey> {
+        let mut stale = changed.clone();
+        for pair in changed {
             let common = |k: &ScanKey| {
                 self.edges.contains_key(&PairKey::of(pair.a, *k))
                     && self.edges.contains_key(&PairKey::of(pair.b, *k))
@@ -226,39 +241,53 @@ impl ScanGraph {
                 stale.insert(PairKey::of(pair.b, k));
             }
         }
-        self.refresh_support(&stale.into_iter().collect::<Vec<_>>(), options);
+        stale
     }
 
-    fn edges_within(&self, scans: &[ScanKey]) -> Vec<PairKey> {
-        let mut pairs = Vec::new();
-        for (i, x) in scans.iter().enumerate() {
-            for y in &scans[i + 1..] {
-                let pair = PairKey::of(*x, *y);
-                if self.edges.contains_key(&pair) {
-                    pairs.push(pair);
-                }
+    fn edges_within(&self, scans: &[ScanKey]) -> BTreeSet<PairKey> {
+        let pairs =
+            scans.iter().enumerate().flat_map(|(i, x)| scans[i + 1..].iter().map(|y| PairKey::of(*x, *y)));
+        pairs.filter(|pair| self.edges.contains_key(pair)).collect()
+    }
+
+    /// Renews the support of these edges, and of those on which they shed another light.
+    fn refresh_support(&mut self, stale: &BTreeSet<PairKey>, options: &SupportOptions) {
+        let Some(fitted) = options.verifier.share_of_right() else {
+            return self.renew_support(stale, options);
+        };
+        for (pair, values) in self.supports(stale, Corrections::Ignored, options) {
+            if let Some(edge) = self.edges.get_mut(&pair) {
+                edge.plain_score = values.iter().map(|(_, score)| *score).fold(f64::NEG_INFINITY, f64::max);
             }
         }
-        pairs
-    }
-
-    /// Renews the support of these edges; of all, if what they are worth together has changed.
-    fn refresh_support(&mut self, stale: &[PairKey], options: &SupportOptions) {
-        let correction = correction(self.edges.values(), options.verifier.share_of_right());
-        if correction == self.correction {
-            self.renew_support(stale, options);
-        } else {
-            self.correction = correction;
-            self.renew_support(&self.edges.keys().copied().collect::<Vec<_>>(), options);
+        let cohorts = Cohorts::of(self.edges.values());
+        let of_pair: BTreeMap<PairKey, f64> =
+            self.edges.iter().map(|(pair, edge)| (*pair, cohorts.correction(edge))).collect();
+        self.correction = in_steps(correction(self.edges.values(), &of_pair, fitted));
+        let mut changed = stale.clone();
+        for (pair, edge) in &mut self.edges {
+            let correction = self.correction + in_steps(of_pair[pair]);
+            if correction != edge.correction {
+                edge.correction = correction;
+                changed.insert(*pair);
+            }
         }
+        self.renew_support(&self.with_triangles(changed), options);
     }
 
-    fn renew_support(&mut self, stale: &[PairKey], options: &SupportOptions) {
-        let fresh: Vec<(PairKey, Vec<(f64, f64)>)> = stale
-            .par_iter()
-            .filter_map(|pair| Some((*pair, support(self, self.edges.get(pair)?, options))))
-            .collect();
-        for (pair, values) in fresh {
+    /// (support, score) of the hypotheses of these edges.
+    fn supports(
+        &self,
+        pairs: &BTreeSet<PairKey>,
+        corrections: Corrections,
+        options: &SupportOptions,
+    ) -> Vec<(PairKey, Vec<(f64, f64)>)> {
+        let edges: Vec<&Edge> = pairs.iter().filter_map(|pair| self.edges.get(pair)).collect();
+        edges.par_iter().map(|edge| (edge.pair, support(self, edge, corrections, options))).collect()
+    }
+
+    fn renew_support(&mut self, stale: &BTreeSet<PairKey>, options: &SupportOptions) {
+        for (pair, values) in self.supports(stale, Corrections::Counted, options) {
             let Some(edge) = self.edges.get_mut(&pair) else { continue };
             for (hypothesis, (support, score)) in edge.hypotheses.iter_mut().zip(values) {
                 hypothesis.support = support;
@@ -270,4 +299,8 @@ impl ScanGraph {
             });
         }
     }
+}
+
+fn in_steps(correction: f64) -> f64 {
+    (correction / STEP).round() * STEP
 }

@@ -9,6 +9,10 @@ use crate::pairwise::{TRIPLET_FEATURES, Verifier, centred_difference, shipped_ve
 /// What stands for the log-odds of a rival when there is none.
 const NO_RIVAL: f64 = -12.0;
 
+/// Paths take account of how rare right poses are this many times over: third scans that see the same surfaces repeat each other's mistakes, and the
+/// rarer right poses are, the more of what they repeat is wrong.
+const PATHS: f64 = 2.0;
+
 /// Who judges pairs, when two motions agree, and when they are rivals. Angles in radians, distances in voxels at the moved scan's centroid.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SupportOptions {
@@ -49,26 +53,56 @@ struct Paths {
     opposing: f64,
 }
 
+/// What log-odds are raised by for what is known of the whole project.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Corrections {
+    /// Nothing.
+    Ignored,
+    /// The correction of each edge.
+    Counted,
+}
+
+impl Corrections {
+    fn of_pair(self, edge: &Edge) -> f64 {
+        match self {
+            Self::Ignored => 0.0,
+            Self::Counted => edge.correction,
+        }
+    }
+
+    fn of_path(self, edge: &Edge, graph: &ScanGraph) -> f64 {
+        match self {
+            Self::Ignored => 0.0,
+            Self::Counted => edge.correction + (PATHS - 1.0) * graph.correction(),
+        }
+    }
+}
+
 /// (support, score with triplets) of each hypothesis of an edge, in the edge's order.
-pub(super) fn support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<(f64, f64)> {
-    let supports = path_support(graph, edge, options);
+pub(super) fn support(
+    graph: &ScanGraph,
+    edge: &Edge,
+    corrections: Corrections,
+    options: &SupportOptions,
+) -> Vec<(f64, f64)> {
+    let supports = path_support(graph, edge, corrections, options);
     (0..edge.hypotheses.len())
         .map(|h| {
             let features = features_of(graph, edge, &supports, h, options);
-            (supports[h].agreeing, options.verifier.triplet.logit(&features) + graph.correction())
+            (supports[h].agreeing, options.verifier.triplet.logit(&features) + corrections.of_pair(edge))
         })
         .collect()
 }
 
 /// The features of the second regression for each hypothesis of an edge: the pair's log-odds, log support, the same of the best
-/// different pose of the pair, and log opposition.
+/// different pose of the pair, and log opposition. Nothing is corrected for what is known of the whole graph.
 #[must_use]
 pub fn triplet_features(
     graph: &ScanGraph,
     edge: &Edge,
     options: &SupportOptions,
 ) -> Vec<[f64; TRIPLET_FEATURES]> {
-    let supports = path_support(graph, edge, options);
+    let supports = path_support(graph, edge, Corrections::Ignored, options);
     (0..edge.hypotheses.len()).map(|h| features_of(graph, edge, &supports, h, options)).collect()
 }
 
@@ -99,17 +133,21 @@ fn likelihood(h: &Supported, correction: f64) -> f64 {
     1.0 / (1.0 + (-h.hypothesis.logit - correction).exp())
 }
 
-fn path_support(graph: &ScanGraph, edge: &Edge, options: &SupportOptions) -> Vec<Paths> {
+fn path_support(
+    graph: &ScanGraph,
+    edge: &Edge,
+    corrections: Corrections,
+    options: &SupportOptions,
+) -> Vec<Paths> {
     let (a, b) = (edge.pair.a, edge.pair.b);
     let mut supports = vec![Paths::default(); edge.hypotheses.len()];
     let Some(scan_b) = graph.scan(b) else { return supports };
     let reach = options.agree_voxels * scan_b.prepared.resolution;
-    let correction = graph.correction();
     for k in graph.neighbors(a).filter(|k| *k != b) {
         let (Some(first), Some(second)) = (graph.edge(a, k), graph.edge(k, b)) else { continue };
         let legs = |edge: &Edge, from| -> Vec<(Pose, f64)> {
             edge.motions_from(from)
-                .map(|(motion, h)| (motion, likelihood(h, correction)))
+                .map(|(motion, h)| (motion, likelihood(h, corrections.of_path(edge, graph))))
                 .filter(|(_, p)| *p > options.least_likelihood)
                 .collect()
         };

@@ -12,11 +12,11 @@ use crate::graph::ScanGraph;
 use crate::pairwise::centred_difference;
 
 /// A scan is filtered at most this often while the model does not forget.
-const MAX_FILTERED: usize = 2;
+pub const MAX_FILTERED: usize = 2;
 /// A scan is filtered only from components of at least this many scans.
 const FILTER_FROM: usize = 4;
 /// … and only if another place has this much more support than the one it has.
-const FILTER_MARGIN: f64 = 2.0;
+pub const FILTER_MARGIN: f64 = 2.0;
 
 impl Mapper {
     /// Filtering: takes out scans that have clearly more support at another pose than at their own; they wait, and may register again. Those that
@@ -52,10 +52,7 @@ impl Mapper {
                     .filter(better)
                     .is_some_and(|best| differs(&best.a_from_b, pose, *scan, graph, voxel, options));
                 let others = self.components.iter().enumerate().filter(|(other, _)| *other != index);
-                let held = options.decisions.joined_pairs().any(|pair| {
-                    let other = if pair.a == *scan { pair.b } else { pair.a };
-                    (pair.a == *scan || pair.b == *scan) && component.poses.contains_key(&other)
-                });
+                let held = held_by_client(component, *scan, options);
                 let in_another = || {
                     let mut bests =
                         others.filter_map(|(_, other)| best_candidate(graph, other, &single, voxel, options));
@@ -81,6 +78,14 @@ impl Mapper {
         self.dissolve_small();
         Ok(misplaced.len())
     }
+}
+
+/// Whether a client joined a scan to another of its component.
+pub fn held_by_client(component: &Component, scan: ScanKey, options: &MappingOptions) -> bool {
+    options.decisions.joined_pairs().any(|pair| {
+        let other = if pair.a == scan { pair.b } else { pair.a };
+        (pair.a == scan || pair.b == scan) && component.poses.contains_key(&other)
+    })
 }
 
 fn differs(

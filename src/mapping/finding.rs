@@ -98,7 +98,7 @@ impl Case<'_> {
             return Ok(Finding::Torn { side, strongest });
         }
         match undecided(graph, component, testimony, voxel, options, control)? {
-            Some(Undecided { strongest, rivals: true, .. }) => return Ok(Finding::Folded { strongest }),
+            Some(Undecided { strongest, alike: true, .. }) => return Ok(Finding::Folded { strongest }),
             Some(Undecided { side, strongest, .. }) => return Ok(Finding::Torn { side, strongest }),
             None => {}
         }

@@ -290,7 +290,7 @@ impl Mapper {
     }
 
     /// Waiting scans that may be joined.
-    fn free(&self) -> BTreeSet<ScanKey> {
+    pub(super) fn free(&self) -> BTreeSet<ScanKey> {
         let free = |scan: &&ScanKey| !self.doubted.contains(scan) && !self.set_aside.contains(scan);
         self.waiting.keys().filter(free).copied().collect()
     }

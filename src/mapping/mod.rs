@@ -30,6 +30,7 @@ mod open_join;
 mod options;
 mod parting;
 mod policy;
+mod reclaim;
 mod refine;
 mod refusals;
 mod snapshot;

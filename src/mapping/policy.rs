@@ -41,7 +41,9 @@ pub fn grow(
             options.firm_levels()
         };
         join_all(mapper, graph, levels, voxel, &options, control)?;
-        if mapper.filter_scans(graph, voxel, &options, control)? > 0 {
+        if mapper.filter_scans(graph, voxel, &options, control)? > 0
+            || mapper.reclaim(graph, voxel, &options, control)?
+        {
             continue;
         }
         if let Some(bans) = mapper.undo_contradicted(graph, voxel, &options, control)? {

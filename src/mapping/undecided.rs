@@ -25,6 +25,8 @@ const NEARLY_AS_GOOD: f64 = 0.5;
 const TRIED: usize = 8;
 /// Evidence for another pose below this is noise: a likelihood of 0.63.
 const LEAST_DOUBT: f64 = 1.0;
+/// Pairs that say the same show that places are alike. A single one may be wrong by itself, and what it leaves in doubt is only the cut.
+const ALIKE_PAIRS: usize = 2;
 /// A gain of a move below this is rounding.
 const NO_GAIN: f64 = -1e-9;
 
@@ -34,8 +36,8 @@ pub struct Undecided {
     pub side: BTreeSet<ScanKey>,
     /// The pair that led to it.
     pub strongest: Contradiction,
-    /// Both poses are about as good; otherwise another is better.
-    pub rivals: bool,
+    /// Places are alike: both poses are about as good, and several pairs say so. Otherwise the sides only do not belong together as they are.
+    pub alike: bool,
 }
 
 /// The first of the component's doubtful cuts, the most doubtful first, whose two sides a join would not put together as they are, unless a hearing
@@ -80,7 +82,8 @@ pub fn undecided(
             {
                 continue;
             }
-            return Ok(Some(Undecided { side: smaller_side(component, side), strongest, rivals }));
+            let alike = rivals && voice.len() >= ALIKE_PAIRS;
+            return Ok(Some(Undecided { side: smaller_side(component, side), strongest, alike }));
         }
     }
     Ok(None)
