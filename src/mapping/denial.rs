@@ -43,11 +43,13 @@ const DENIED_SHARE: f64 = 0.01;
 /// Where this share of all pairs shares much, as all do in rooms that were folded onto each other, one pair is enough: what has changed there would
 /// be seen by many. …
 const CROWDED: f64 = 0.5;
-/// … Each of its scans shares much with so many others, …
+/// … Or so many that are not by themselves enough, …
+const CROWDED_PAIRS: usize = 2;
+/// … of which each scan shares much with so many others, …
 const LEAST_SHARING: usize = 6;
-/// … of which it denies less than this share, as it would if it were to blame, …
+/// … and denies less than this share of them, as it would if it were to blame. …
 const BLAMED_SHARE: f64 = 0.25;
-/// … and the pair lies in free space by this many times what is usual …
+/// … One that is enough lies in free space by this many times what is usual …
 const STRONG_CONTRAST: f64 = 8.0;
 /// … and this share more. Of seven identical rooms, the ends of whose corridor only one pair sees, it puts 1.9 % there; in halls of which half the
 /// furniture was moved, no pair denies anything.
@@ -149,14 +151,15 @@ impl Denials {
         self.denying.first().is_none_or(|first| !first.seen.scans().into_iter().any(in_all))
     }
 
-    /// Whether one pair is enough where all see the same place.
+    /// Whether one pair is enough where all see the same place, or with others.
     fn is_enough(&self, denial: &Denial) -> bool {
         let stands_out = |scan: ScanKey| {
             let sharing = self.sharing.get(&scan).copied().unwrap_or_default();
             let denied = self.denying.iter().filter(|other| other.seen.scans().contains(&scan)).count();
             sharing >= LEAST_SHARING && (denied as f64) < BLAMED_SHARE * sharing as f64
         };
-        denial.strong && denial.seen.scans().into_iter().all(stands_out)
+        (denial.strong || self.denying.len() >= CROWDED_PAIRS)
+            && denial.seen.scans().into_iter().all(stands_out)
     }
 }
 
@@ -226,6 +229,7 @@ mod tests {
         let no = |pair, violations| (pair, -3.0, violations);
         assert!(is_denied_by(8, &[no((1, 2), 40)], 600, 0.1));
         assert!(!is_denied_by(8, &[no((1, 2), 16)], 600, 0.1), "that may be chance");
+        assert!(is_denied_by(8, &[no((1, 2), 16), no((3, 4), 16)], 600, 0.1), "twice it is none");
         assert!(!is_denied_by(8, &[no((1, 2), 40), no((1, 3), 40)], 600, 0.1), "scan 1 is off");
         assert!(!is_denied_by(6, &[no((1, 2), 40)], 600, 0.1), "few would see what has changed");
     }

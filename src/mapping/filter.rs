@@ -2,8 +2,10 @@
 
 use super::candidates::{Candidate, best_candidate, support_of};
 use super::component::Component;
+use super::join::Refusal;
 use super::mapper::Mapper;
 use super::options::MappingOptions;
+use super::refusals::Link;
 use super::tracks::Tracks;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
@@ -18,9 +20,13 @@ const FILTER_FROM: usize = 4;
 /// … and only if another place has this much more support than the one it has.
 pub const FILTER_MARGIN: f64 = 2.0;
 
+/// … or this share of it, where the other place is in a component that does not fit the scan's own.
+const NEARLY_AS_MUCH: f64 = 0.5;
+
 impl Mapper {
     /// Filtering: takes out scans that have clearly more support at another pose than at their own; they wait, and may register again. Those that
-    /// nothing firm holds and that have clearly more support in another component are taken out, too, and set aside. Returns how many.
+    /// nothing firm holds and that have clearly more support in another component are taken out, too, and set aside; and those with nearly as much in one
+    /// that their own does not fit. Returns how many.
     pub fn filter_scans(
         &mut self,
         graph: &ScanGraph,
@@ -60,7 +66,10 @@ impl Mapper {
                 };
                 if elsewhere {
                     misplaced.push(*scan);
-                } else if !held && own < options.firm_support && in_another() {
+                } else if !held
+                    && (own < options.firm_support && in_another()
+                        || self.is_torn((index, component), &single, own, graph, voxel, options))
+                {
                     misplaced.push(*scan);
                     torn.push(*scan);
                 }
@@ -77,6 +86,30 @@ impl Mapper {
         self.set_aside.extend(torn);
         self.dissolve_small();
         Ok(misplaced.len())
+    }
+}
+
+impl Mapper {
+    /// Whether a scan, which has this support in its component, has nearly as much, and firmly, in another that does not fit it: both cannot be right.
+    fn is_torn(
+        &self,
+        (index, component): (usize, &Component),
+        single: &Component,
+        own: f64,
+        graph: &ScanGraph,
+        voxel: f64,
+        options: &MappingOptions,
+    ) -> bool {
+        let others = self.components.iter().enumerate().filter(|(other, _)| *other != index);
+        let mut apart = others.filter(|(_, other)| {
+            let refusal = self.refused.get(Link::between(component.gauge, other.gauge));
+            matches!(refusal, Some(Refusal::Violation { .. } | Refusal::Rival { .. }))
+        });
+        apart.any(|(_, other)| {
+            best_candidate(graph, other, single, voxel, options).is_some_and(|best| {
+                best.rests_on_several() && best.support > options.firm_support.max(NEARLY_AS_MUCH * own)
+            })
+        })
     }
 }
 
@@ -103,9 +136,12 @@ fn differs(
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
     use crate::control::{CancelToken, Silent};
     use crate::mapping::decision::{Decision, Decisions, between_own_frames};
+    use crate::mapping::refusals::Refused;
     use crate::mapping::test_hall::Model;
     use crate::pairwise::{PairKey, PairResult};
 
@@ -141,5 +177,42 @@ mod tests {
             between_own_frames(&graph, ScanKey(1), ScanKey(8), &local).expect("both are in the graph");
         options.decisions = Decisions::new(&[Decision::join(ScanKey(1), ScanKey(8), &decided)]);
         assert_eq!(filtered(&graph, &options), [], "a client has the last word");
+    }
+
+    #[test]
+    fn a_scan_that_two_components_claim_which_do_not_fit_each_other_is_set_aside() {
+        let model = Model::new(8);
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let options = MappingOptions::default();
+        let mut graph = model.graph.clone();
+        // The first four would have the eighth at the other end, and know nothing of the others; those have it where it belongs.
+        let results = [1, 2, 3, 4].into_iter().flat_map(|k| [5, 6, 7, 8].map(|of| (k, of))).map(|(k, of)| {
+            let edge = model.graph.edge(ScanKey(k), ScanKey(of)).expect("all pairs were tried");
+            let mut hypotheses: Vec<_> = edge.hypotheses.iter().map(|h| h.hypothesis).collect();
+            hypotheses.retain(|_| of == 8);
+            for hypothesis in &mut hypotheses {
+                hypothesis.a_from_b = model.contradiction((k, of), false).a_from_b;
+            }
+            PairResult { pair: PairKey::of(ScanKey(k), ScanKey(of)), matches: Vec::new(), hypotheses }
+        });
+        graph.add_results(results.collect::<Vec<_>>(), &options.support);
+        let wrong = model.with_turned(&[8]);
+        let part = |scans: &[u128]| {
+            let scans = scans.iter().map(|scan| ScanKey(*scan));
+            let poses: BTreeMap<ScanKey, Pose> = scans.map(|scan| (scan, wrong.poses[&scan])).collect();
+            Component { gauge: *poses.keys().next().expect("some"), poses, tracks: Tracks::default() }
+        };
+        let mut mapper =
+            Mapper { components: vec![part(&[1, 2, 3, 4, 8]), part(&[5, 6, 7])], ..Mapper::default() };
+        let filtered =
+            |mapper: &mut Mapper| mapper.filter_scans(&graph, model.hall.resolution, &options, control);
+        assert_eq!(filtered(&mut mapper), Ok(0), "they may be parts of one place");
+        let refusal = Refusal::Violation { found: 0.3, allowed: 0.1 };
+        let refused = Refused { support: 8.0, needed: 8.0, refusal };
+        mapper.refused.insert(Link::between(ScanKey(1), ScanKey(5)), refused);
+        assert_eq!(filtered(&mut mapper), Ok(1));
+        assert!(mapper.set_aside.contains(&ScanKey(8)) && mapper.waiting.contains_key(&ScanKey(8)));
+        assert_eq!(mapper.components.iter().map(Component::len).collect::<Vec<_>>(), [4, 3]);
     }
 }

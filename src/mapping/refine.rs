@@ -24,6 +24,8 @@ pub const DENSE_POINTS: usize = 1000;
 /// Last gate of the dense adjustment in voxels, and gate of its held-out measure.
 const LAST_GATE_VOXELS: f64 = 1.6;
 pub const HELD_OUT_GATE_VOXELS: f64 = 2.0;
+/// The weight of landmarks beside surfaces, at least, for surfaces that fit far better than keypoints repeat, and at most.
+const LANDMARK_WEIGHTS: (f64, f64) = (0.01, 1.0);
 /// Scale of the robust loss on landmark distances, in voxels.
 const LANDMARK_KERNEL_VOXELS: f64 = 1.0;
 /// Rounds of adjust, complete, merge, filter in a global bundle adjustment …
@@ -255,7 +257,7 @@ pub struct DenseOutcome {
     pub last: Option<Report>,
 }
 
-/// Joint dense adjustment of all overlapping pairs with the landmarks as a weak tie. With `free`, only those scans move and only
+/// Joint dense adjustment of all overlapping pairs and the landmarks. With `free`, only those scans move and only
 /// their pairs count. `None` when nothing overlaps.
 pub fn dense(
     graph: &ScanGraph,
@@ -272,12 +274,15 @@ pub fn dense(
     let gauge = component.gauge;
     let held = indexed.held_but(|key| *key != gauge && is_free(key));
     let tracks = indexed.tracks(component, |observations| observations.iter().any(|o| is_free(&o.scan)));
-    let settings = DenseOptions::with_gates(reach.first_gate_voxels * voxel, LAST_GATE_VOXELS * voxel);
+    let gate = HELD_OUT_GATE_VOXELS * voxel;
+    let before = surfaces.held_out_rms(&indexed.poses, gate);
+    let settings = DenseOptions {
+        landmark_weight: landmark_weight(&tracks, &indexed.poses, before),
+        ..DenseOptions::with_gates(reach.first_gate_voxels * voxel, LAST_GATE_VOXELS * voxel)
+    };
     let problem = DenseProblem { poses: &indexed.poses, held: &held, surfaces: &surfaces, tracks: &tracks };
     match adjust_dense(&problem, &settings, control) {
         Ok(adjusted) => {
-            let gate = HELD_OUT_GATE_VOXELS * voxel;
-            let before = surfaces.held_out_rms(&indexed.poses, gate);
             let after = surfaces.held_out_rms(&adjusted.poses, gate);
             write_back(component, &indexed.keys, &adjusted.poses);
             let last = adjusted.rounds.last().map(|round| round.report);
@@ -288,10 +293,55 @@ pub fn dense(
     }
 }
 
+/// What an observation of a landmark weighs against a correspondence of surfaces: the variance of the distances of surfaces, whose root mean square
+/// is given (metres), over that of observations from their landmark, along an axis. Rigid scans of a good scanner lie on each other far better
+/// than keypoints repeat; where scans are bent, as those that were fused while a camera moved, one overlap's surfaces pull them together there and
+/// apart elsewhere, and landmarks are the better guide.
+fn landmark_weight(tracks: &[Track], poses: &[Pose], surface_rms: f64) -> f64 {
+    let (mut squares, mut freedom) = (0.0, 0.0);
+    for track in tracks {
+        let places: Vec<Vector3<f64>> =
+            track.observations.iter().map(|o| poses[o.scan].transform(&o.point_in_scan)).collect();
+        let mean = places.iter().sum::<Vector3<f64>>() / places.len().max(1) as f64;
+        squares += places.iter().map(|place| (place - mean).norm_squared()).sum::<f64>();
+        freedom += 3.0 * (places.len() as f64 - 1.0);
+    }
+    let (least, most) = LANDMARK_WEIGHTS;
+    let ratio = surface_rms * surface_rms * freedom / squares;
+    if ratio.is_nan() { least } else { ratio.clamp(least, most) }
+}
+
 /// Held-out RMS of a component as it stands, metres.
 #[must_use]
 pub fn held_out(graph: &ScanGraph, component: &Component, voxel: f64) -> f64 {
     let poses: Vec<Pose> = component.poses.values().copied().collect();
     ComponentSurfaces::new(graph, component, |_| true, DENSE_POINTS)
         .held_out_rms(&poses, HELD_OUT_GATE_VOXELS * voxel)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn landmarks_weigh_what_their_spread_is_worth_against_that_of_surfaces() {
+        let poses = [Pose::identity(), Pose::from_translation(Vector3::new(1.0, -2.0, 3.0))];
+        // Two observations of each landmark, 20 cm apart along one axis: a variance of 1/150 m^2 along an axis.
+        let track = |k: usize| {
+            let point: Vector3<f64> = Vector3::new(k as f64, 2.0, -1.0);
+            let mut apart = Vector3::zeros();
+            apart[k % 3] = 0.2;
+            let observed = [point, poses[1].inverse().transform(&(point + apart))];
+            let observation = |(scan, point_in_scan)| Observation { scan, point_in_scan, weight: 1.0 };
+            let observations = observed.into_iter().enumerate().map(observation).collect();
+            Track { observations, held_landmark: None }
+        };
+        let tracks: Vec<Track> = (0..30).map(track).collect();
+        let weight = landmark_weight(&tracks, &poses, 0.02);
+        assert!((weight - 0.0004 * 150.0).abs() < 1e-9, "{weight}");
+        let (least, most) = LANDMARK_WEIGHTS;
+        assert_eq!(landmark_weight(&tracks, &poses, 1e-4), least);
+        assert_eq!(landmark_weight(&tracks, &poses, 1.0), most);
+        assert_eq!(landmark_weight(&[], &poses, 0.02), least, "without landmarks there is nothing to weigh");
+    }
 }

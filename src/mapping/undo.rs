@@ -60,7 +60,7 @@ impl Mapper {
         // Components of which a part turned out to be folded, with what was said of it: what else they came apart into is of the same alike
         // places.
         let mut folded: BTreeMap<usize, Fold> = BTreeMap::new();
-        // How many of their scans were found open.
+        // How many of their scans were found open, or torn off after such.
         let mut opened: BTreeMap<usize, usize> = BTreeMap::new();
         let mut bans = None;
         while let Some((origin, mut component)) = pending.pop() {
@@ -83,11 +83,17 @@ impl Mapper {
             let case =
                 Case { graph, component: &component, supports: &supports, testimony: &testimony, options };
             let mut finding = case.finding(&asked, &waits, voxel, control)?;
-            if let Finding::Open { scans, strongest } = &finding {
-                let before = opened.get(&origin).copied().unwrap_or_default();
-                opened.insert(origin, before + scans.len());
-                if are_alike(before, scans.len(), component.len()) {
-                    finding = Finding::Folded { strongest: *strongest };
+            let before = opened.get(&origin).copied().unwrap_or_default();
+            let leaving = match &finding {
+                Finding::Open { scans, strongest } => Some((scans.len(), *strongest)),
+                // Of alike places, what is torn off after scans were found open is as likely what shows that the rest is folded.
+                Finding::Torn { side, strongest } if before > 0 => Some((side.len(), *strongest)),
+                _ => None,
+            };
+            if let Some((count, strongest)) = leaving {
+                opened.insert(origin, before + count);
+                if are_alike(before, count, component.len()) {
+                    finding = Finding::Folded { strongest };
                 }
             }
             match finding {
@@ -143,7 +149,8 @@ impl Mapper {
     }
 }
 
-/// Whether places are alike of which it is open where more and more scans belong: those found open before, and now, of so many left with the latter.
+/// Whether places are alike of which it is open where more and more scans belong: those found open before, and those that leave now, of so many left with
+/// the latter.
 const fn are_alike(before: usize, now: usize, left: usize) -> bool {
     before > 0 && OPEN_OF * (before + now) > before + left
 }
