@@ -155,7 +155,7 @@ impl Surroundings<'_> {
         }
     }
 
-    /// The moments of the points in the radius of one of the queries that these surroundings are of.
+    /// The moments of the points in the radius of one of the queries that these surroundings are of. How they round depends on the other queries.
     #[must_use]
     pub fn moments(&self, point: &Point) -> Moments {
         let mut lanes = [[0.0_f32; LANES]; 10];
@@ -264,7 +264,12 @@ mod tests {
             let mut alone = Vec::new();
             index.within(&queries[query], 1.2, |i, square| alone.push((i, square.to_bits())));
             assert_eq!((number, found), (query, alone));
-            assert_eq!(moments.count, index.moments(&queries[query], 1.2).count);
+            let single = index.moments(&queries[query], 1.2);
+            assert_eq!(moments.count, single.count);
+            let sums = moments.sum.iter().zip(&single.sum);
+            for (x, y) in sums.chain(moments.products.iter().zip(&single.products)) {
+                assert!((x - y).abs() < 1e-3, "{x} is not {y}");
+            }
         }
     }
 

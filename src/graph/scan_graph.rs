@@ -263,16 +263,23 @@ impl ScanGraph {
         let cohorts = Cohorts::of(self.edges.values());
         let of_pair: BTreeMap<PairKey, f64> =
             self.edges.iter().map(|(pair, edge)| (*pair, cohorts.correction(edge))).collect();
+        let before = self.correction;
         self.correction = in_steps(correction(self.edges.values(), &of_pair, fitted));
-        let mut changed = stale.clone();
+        let mut corrected = BTreeSet::new();
         for (pair, edge) in &mut self.edges {
             let correction = self.correction + in_steps(of_pair[pair]);
             if correction != edge.correction {
                 edge.correction = correction;
-                changed.insert(*pair);
+                corrected.insert(*pair);
             }
         }
-        self.renew_support(&self.with_triangles(changed), options);
+        // What all are worth together counts in every path.
+        let renewed = if self.correction == before {
+            stale.union(&self.with_triangles(corrected)).copied().collect()
+        } else {
+            self.edges.keys().copied().collect()
+        };
+        self.renew_support(&renewed, options);
     }
 
     /// (support, score) of the hypotheses of these edges.

@@ -141,8 +141,9 @@ impl Denials {
         let first = self.denying.first().filter(|_| several);
         let crowded =
             pairs_that_share as f64 >= CROWDED * (self.scans * self.scans.saturating_sub(1) / 2) as f64;
-        let alone = || self.denying.iter().find(|denial| crowded && self.is_enough(denial));
-        first.or_else(alone).map(|denial| denial.seen.contradiction)
+        first
+            .or_else(|| self.outstanding(pairs_that_share).filter(|_| crowded))
+            .map(|denial| denial.seen.contradiction)
     }
 
     /// Whether no scan is in all of the pairs.
@@ -151,15 +152,18 @@ impl Denials {
         self.denying.first().is_none_or(|first| !first.seen.scans().into_iter().any(in_all))
     }
 
-    /// Whether one pair is enough where all see the same place, or with others.
-    fn is_enough(&self, denial: &Denial) -> bool {
+    /// Where all see the same place: a pair that is enough by itself, or the surest of several, of scans that are not to blame.
+    fn outstanding(&self, pairs_that_share: usize) -> Option<&Denial> {
         let stands_out = |scan: ScanKey| {
             let sharing = self.sharing.get(&scan).copied().unwrap_or_default();
             let denied = self.denying.iter().filter(|other| other.seen.scans().contains(&scan)).count();
             sharing >= LEAST_SHARING && (denied as f64) < BLAMED_SHARE * sharing as f64
         };
-        (denial.strong || self.denying.len() >= CROWDED_PAIRS)
-            && denial.seen.scans().into_iter().all(stands_out)
+        let blameless = self.denying.iter().filter(|denial| denial.seen.scans().into_iter().all(stands_out));
+        let found: Vec<&Denial> = blameless.collect();
+        let several =
+            found.len() >= CROWDED_PAIRS && found.len() as f64 >= DENIED_SHARE * pairs_that_share as f64;
+        found.iter().find(|denial| denial.strong || several).copied()
     }
 }
 
@@ -230,6 +234,7 @@ mod tests {
         assert!(is_denied_by(8, &[no((1, 2), 40)], 600, 0.1));
         assert!(!is_denied_by(8, &[no((1, 2), 16)], 600, 0.1), "that may be chance");
         assert!(is_denied_by(8, &[no((1, 2), 16), no((3, 4), 16)], 600, 0.1), "twice it is none");
+        assert!(!is_denied_by(8, &[no((1, 2), 16), no((1, 3), 16)], 600, 0.1), "scan 1 is off");
         assert!(!is_denied_by(8, &[no((1, 2), 40), no((1, 3), 40)], 600, 0.1), "scan 1 is off");
         assert!(!is_denied_by(6, &[no((1, 2), 40)], 600, 0.1), "few would see what has changed");
     }

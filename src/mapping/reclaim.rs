@@ -11,11 +11,14 @@ use super::options::MappingOptions;
 use super::refusals::Link;
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
+use crate::geometry::Pose;
 use crate::graph::{ScanGraph, softplus};
 
 /// A scan that a waiting scan has more in common with than its component.
 struct Claim {
-    /// Evidence for the two, beyond what holds the scan where it is.
+    /// What holds the scan where it is.
+    held: f64,
+    /// Evidence for the two, beyond that.
     lead: f64,
     component: usize,
     scan: ScanKey,
@@ -32,6 +35,10 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<bool, Cancelled> {
         let Some(level) = options.firm_levels().last() else { return Ok(false) };
+        // Where alike places were found, no pair says enough by itself.
+        if !self.doubted.is_empty() {
+            return Ok(false);
+        }
         for claim in self.claims(graph, options) {
             control.check()?;
             let (mut started, other) = (Component::single(claim.scan), Component::single(claim.by));
@@ -41,6 +48,9 @@ impl Mapper {
             else {
                 continue;
             };
+            if common(graph, &claim, &a_from_b, options) - claim.held <= FILTER_MARGIN {
+                continue;
+            }
             *self.filtered.entry(claim.scan).or_default() += 1;
             self.components[claim.component].remove(claim.scan, options);
             started.absorb(other, &a_from_b, graph, options);
@@ -70,9 +80,10 @@ impl Mapper {
                         continue;
                     }
                     let common = graph.edge(scan, by).map_or(0.0, |edge| softplus(edge.best_score()));
-                    let lead = common - holding(graph, component, scan, options);
+                    let held = holding(graph, component, scan, options);
+                    let lead = common - held;
                     if common >= options.firm_support && lead > FILTER_MARGIN {
-                        found.push(Claim { lead, component: index, scan, by });
+                        found.push(Claim { held, lead, component: index, scan, by });
                     }
                 }
             }
@@ -80,6 +91,13 @@ impl Mapper {
         found.sort_by(|x, y| y.lead.total_cmp(&x.lead).then((x.scan, x.by).cmp(&(y.scan, y.by))));
         found
     }
+}
+
+/// What the pair of a claim says for the pose at which its scans were joined.
+fn common(graph: &ScanGraph, claim: &Claim, scan_from_by: &Pose, options: &MappingOptions) -> f64 {
+    let Some(edge) = graph.edge(claim.scan, claim.by) else { return 0.0 };
+    let joined = if edge.pair.a == claim.scan { *scan_from_by } else { scan_from_by.inverse() };
+    agreeing(graph, edge, &joined, options).map_or(0.0, |h| softplus(h.score))
 }
 
 /// What the pairs of a scan say for where it is in its component. As all that one pair says for a claim is weighed, so is all that each says
@@ -151,7 +169,10 @@ mod tests {
         );
         assert!(!reclaimed(&mut mapper, &options), "a client put it there");
         options.decisions = free;
-        assert_eq!(mapper.components.len(), untouched.components.len());
+        assert_eq!(mapper.components[0].poses, untouched.components[0].poses);
+        let mut often = mapper.clone();
+        often.filtered.insert(ScanKey(4), MAX_FILTERED);
+        assert!(!reclaimed(&mut often, &options), "it was taken out often enough");
 
         assert!(reclaimed(&mut mapper, &options));
         let held: Vec<Vec<u128>> =
@@ -159,6 +180,6 @@ mod tests {
         assert_eq!(held[0], [1, 2, 3]);
         assert!(held[1].contains(&4) && held[1].len() == 2, "{held:?}");
         assert_eq!(mapper.waiting.len(), 1);
-        assert!(!reclaimed(&mut mapper, &options), "once is enough");
+        assert!(!reclaimed(&mut mapper, &options), "nobody claims the others");
     }
 }

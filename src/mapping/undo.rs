@@ -60,6 +60,7 @@ impl Mapper {
         // Components of which a part turned out to be folded, with what was said of it: what else they came apart into is of the same alike
         // places.
         let mut folded: BTreeMap<usize, Fold> = BTreeMap::new();
+        let sizes: Vec<usize> = pending.iter().map(|(_, component)| component.len()).collect();
         // How many of their scans were found open, or torn off after such.
         let mut opened: BTreeMap<usize, usize> = BTreeMap::new();
         let mut bans = None;
@@ -92,7 +93,7 @@ impl Mapper {
             };
             if let Some((count, strongest)) = leaving {
                 opened.insert(origin, before + count);
-                if are_alike(before, count, component.len()) {
+                if are_alike(before, count, sizes[origin]) {
                     finding = Finding::Folded { strongest };
                 }
             }
@@ -149,10 +150,10 @@ impl Mapper {
     }
 }
 
-/// Whether places are alike of which it is open where more and more scans belong: those found open before, and those that leave now, of so many left with
-/// the latter.
-const fn are_alike(before: usize, now: usize, left: usize) -> bool {
-    before > 0 && OPEN_OF * (before + now) > before + left
+/// Whether places are alike of which it is open where more and more scans belong: those found open before, and those that leave now, of so many
+/// at first.
+const fn are_alike(before: usize, now: usize, of: usize) -> bool {
+    before > 0 && OPEN_OF * (before + now) > of
 }
 
 fn refusal(testimony: &Testimony) -> Refusal {
@@ -314,8 +315,8 @@ mod tests {
     #[test]
     fn one_open_scan_is_an_exception_and_one_after_the_other_are_none() {
         assert!(!are_alike(0, 1, 13) && !are_alike(0, 2, 13));
-        assert!(are_alike(1, 1, 12));
-        assert!(!are_alike(1, 1, 19) && are_alike(2, 1, 18));
+        assert!(are_alike(1, 1, 13));
+        assert!(!are_alike(1, 1, 20) && are_alike(2, 1, 20));
     }
 
     #[test]
