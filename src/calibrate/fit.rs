@@ -223,9 +223,7 @@ fn predictions(scene: usize, judged: &[Judged], triplet: &Logistic) -> Vec<Predi
 
 /// Builds the scan graph of a scene in each view and takes the features of every labelled hypothesis.
 fn hypotheses(scene: &MatchedScene, pair: &Logistic) -> Vec<Judged> {
-    let mut options = SupportOptions::default();
-    // Log-odds are taken as they are: how rare right poses are in the scenes is part of what is fitted.
-    Arc::make_mut(&mut options.verifier).provenance.scenes.clear();
+    let options = SupportOptions::default();
     let mut judged = Vec::new();
     for view in GRAPH_VIEWS {
         let differs = |evidence: &Evidence| view.of(evidence).is_some();

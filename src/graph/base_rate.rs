@@ -14,9 +14,10 @@ use crate::pairwise::PairKey;
 const IMAGINED: f64 = 100.0;
 /// Rounds of expectation maximisation. It gains a factor in each and has long settled by then.
 const ROUNDS: usize = 50;
-/// What the log-odds of each hypothesis of these edges are to be raised by, beside what those of its own pair are, which is never above zero: that
-/// right poses are frequent among pairs that retrieval chose is no reason to believe in any. `fitted` is the share that was right where the
-/// verifier was fitted.
+
+/// What the log-odds of all hypotheses of these edges are to be raised by, after those of each pair were by what `of_pair` says. It is never above
+/// zero: that right poses are frequent among pairs that retrieval chose is no reason to believe in any. `fitted` is the share that was right where
+/// the verifier was fitted.
 #[must_use]
 pub(super) fn correction<'e>(
     edges: impl Iterator<Item = &'e Edge>,

@@ -2,7 +2,8 @@
 //!
 //! At each level of strictness, strictest first: register the next scan into a component; else merge two components; else start
 //! a component from an initial pair. Any success goes back to the strictest level, because the model has grown and what waited may
-//! now be well supported. When nothing fits, misplaced scans are filtered and tried again, waiting scans reclaim those that belong to them, and retrieval widens for what stays apart.
+//! now be well supported. When nothing fits, misplaced scans are filtered and tried again, waiting scans reclaim those that belong to them, and
+//! retrieval widens for what stays apart.
 //! Where the pairs that it tries show that right poses are rarer than it seemed, all is joined anew.
 //! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. Where
 //! alike places were found, none but those of the strictest level are made from then on, which no single pair passes. Pieces that a single weak pair, or one scan that sees little, turns out to hold together

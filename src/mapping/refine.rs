@@ -8,6 +8,7 @@ use nalgebra::Vector3;
 use super::component::Component;
 use super::options::MappingOptions;
 use super::surfaces::ComponentSurfaces;
+use super::tracks::{TrackObservation, aggregate};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control, Stage};
 use crate::geometry::{Kernel, Pose};
@@ -70,11 +71,7 @@ impl Indexed {
         self.keys.iter().map(|key| !free(key)).collect()
     }
 
-    fn tracks(
-        &self,
-        component: &Component,
-        keep: impl Fn(&[super::tracks::TrackObservation]) -> bool,
-    ) -> Vec<Track> {
+    fn tracks(&self, component: &Component, keep: impl Fn(&[TrackObservation]) -> bool) -> Vec<Track> {
         component
             .tracks
             .iter()
@@ -276,8 +273,10 @@ pub fn dense(
     let tracks = indexed.tracks(component, |observations| observations.iter().any(|o| is_free(&o.scan)));
     let gate = HELD_OUT_GATE_VOXELS * voxel;
     let before = surfaces.held_out_rms(&indexed.poses, gate);
+    let seen = component.tracks.iter().map(|landmark| landmark.observations.as_slice());
+    let seen = seen.filter(|observations| observations.iter().any(|o| is_free(&o.scan)));
     let settings = DenseOptions {
-        landmark_weight: landmark_weight(&tracks, &indexed.poses, before),
+        landmark_weight: landmark_weight(seen, &component.poses, before),
         ..DenseOptions::with_gates(reach.first_gate_voxels * voxel, LAST_GATE_VOXELS * voxel)
     };
     let problem = DenseProblem { poses: &indexed.poses, held: &held, surfaces: &surfaces, tracks: &tracks };
@@ -297,14 +296,17 @@ pub fn dense(
 /// is given (metres), over that of observations from their landmark, along an axis. Rigid scans of a good scanner lie on each other far better
 /// than keypoints repeat; where scans are bent, as those that were fused while a camera moved, one overlap's surfaces pull them together there and
 /// apart elsewhere, and landmarks are the better guide.
-fn landmark_weight(tracks: &[Track], poses: &[Pose], surface_rms: f64) -> f64 {
+fn landmark_weight<'t>(
+    landmarks: impl Iterator<Item = &'t [TrackObservation]>,
+    poses: &BTreeMap<ScanKey, Pose>,
+    surface_rms: f64,
+) -> f64 {
     let (mut squares, mut freedom) = (0.0, 0.0);
-    for track in tracks {
-        let places: Vec<Vector3<f64>> =
-            track.observations.iter().map(|o| poses[o.scan].transform(&o.point_in_scan)).collect();
-        let mean = places.iter().sum::<Vector3<f64>>() / places.len().max(1) as f64;
-        squares += places.iter().map(|place| (place - mean).norm_squared()).sum::<f64>();
-        freedom += 3.0 * (places.len() as f64 - 1.0);
+    for observations in landmarks {
+        let Some(mean) = aggregate(observations, poses) else { continue };
+        let apart = |o: &TrackObservation| poses[&o.scan].transform(&o.point_in_scan) - mean;
+        squares += observations.iter().map(|o| apart(o).norm_squared()).sum::<f64>();
+        freedom += 3.0 * (observations.len() as f64 - 1.0);
     }
     let (least, most) = LANDMARK_WEIGHTS;
     let ratio = surface_rms * surface_rms * freedom / squares;
@@ -327,21 +329,22 @@ mod tests {
     fn landmarks_weigh_what_their_spread_is_worth_against_that_of_surfaces() {
         let poses = [Pose::identity(), Pose::from_translation(Vector3::new(1.0, -2.0, 3.0))];
         // Two observations of each landmark, 20 cm apart along one axis: a variance of 1/150 m^2 along an axis.
-        let track = |k: usize| {
+        let observed = |k: usize| {
             let point: Vector3<f64> = Vector3::new(k as f64, 2.0, -1.0);
             let mut apart = Vector3::zeros();
             apart[k % 3] = 0.2;
-            let observed = [point, poses[1].inverse().transform(&(point + apart))];
-            let observation = |(scan, point_in_scan)| Observation { scan, point_in_scan, weight: 1.0 };
-            let observations = observed.into_iter().enumerate().map(observation).collect();
-            Track { observations, held_landmark: None }
+            let in_scans = [point, poses[1].inverse().transform(&(point + apart))];
+            let observation =
+                |(scan, point_in_scan)| TrackObservation { scan, keypoint: k as u16, point_in_scan };
+            [1, 2].map(ScanKey).into_iter().zip(in_scans).map(observation).collect::<Vec<_>>()
         };
-        let tracks: Vec<Track> = (0..30).map(track).collect();
-        let weight = landmark_weight(&tracks, &poses, 0.02);
-        assert!((weight - 0.0004 * 150.0).abs() < 1e-9, "{weight}");
+        let landmarks: Vec<Vec<TrackObservation>> = (0..30).map(observed).collect();
+        let poses = [1, 2].map(ScanKey).into_iter().zip(poses).collect();
+        let weight = |rms: f64| landmark_weight(landmarks.iter().map(Vec::as_slice), &poses, rms);
+        assert!((weight(0.02) - 0.0004 * 150.0).abs() < 1e-9, "{}", weight(0.02));
         let (least, most) = LANDMARK_WEIGHTS;
-        assert_eq!(landmark_weight(&tracks, &poses, 1e-4), least);
-        assert_eq!(landmark_weight(&tracks, &poses, 1.0), most);
-        assert_eq!(landmark_weight(&[], &poses, 0.02), least, "without landmarks there is nothing to weigh");
+        assert_eq!(weight(1e-4), least);
+        assert_eq!(weight(1.0), most);
+        assert_eq!(landmark_weight(std::iter::empty(), &poses, 0.02), least, "there is nothing to weigh");
     }
 }
