@@ -11,7 +11,7 @@ use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control, Stage};
 use crate::features::{PreparedScan, Scan};
 use crate::geometry::Pose;
-use crate::pairwise::{FittedScene, PairResult, match_pair, shipped_verifier};
+use crate::pairwise::{FittedScene, PairResult, match_pair_in_full, shipped_verifier};
 
 /// Where a scan truly is.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -171,7 +171,7 @@ pub fn match_scene(scene: TrueScene, control: Control<'_>) -> Result<MatchedScen
         .par_iter()
         .map(|(a, b, truth)| {
             control.check()?;
-            let labelled = label(a, b, match_pair(a, b, &verifier), truth);
+            let labelled = label(a, b, match_pair_in_full(a, b, &verifier), truth);
             control.report(Stage::Match, 1 + done.fetch_add(1, Ordering::Relaxed), pairs.len());
             Ok(labelled)
         })

@@ -28,11 +28,7 @@ pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor>
         });
         near
     });
-    let simple: Vec<Descriptor> = neighborhoods
-        .par_iter()
-        .enumerate()
-        .map(|(me, near)| simplified_histogram(me, near, points, normals))
-        .collect();
+    let simple = simplified_histograms(&neighborhoods, points, normals);
     neighborhoods
         .par_iter()
         .enumerate()
@@ -60,11 +56,44 @@ fn weighted_sum(near: &[(u32, f32)], simple: &[Descriptor]) -> Descriptor {
     sum
 }
 
-/// The SPFH of one point: angles between its normal, its neighbours' normals and the lines between them.
-fn simplified_histogram(me: usize, near: &[(u32, f32)], points: &[Point], normals: &[Point]) -> Descriptor {
+/// The SPFH of all points: angles between the normals of each and of its neighbours and the lines between them. Two neighbours have
+/// the same angles, whichever is asked, so these are computed once.
+fn simplified_histograms(
+    neighborhoods: &[Vec<(u32, f32)>],
+    points: &[Point],
+    normals: &[Point],
+) -> Vec<Descriptor> {
+    let pairs: Vec<Vec<(u32, Bins)>> = neighborhoods
+        .par_iter()
+        .enumerate()
+        .map_init(Vec::new, |later, (me, near)| {
+            later.clear();
+            later.extend(near.iter().filter(|(other, _)| *other as usize > me));
+            pair_bins_with(me, later, points, normals)
+        })
+        .collect();
     // The last entry takes what has no angles.
-    let mut counts = [0.0; DESCRIPTOR_LEN + 1];
+    let mut counts = vec![[0_u32; DESCRIPTOR_LEN + 1]; points.len()];
+    for (me, pairs) in pairs.iter().enumerate() {
+        for (other, bins) in pairs {
+            for bin in bins {
+                counts[me][*bin as usize] += 1;
+                counts[*other as usize][*bin as usize] += 1;
+            }
+        }
+    }
+    let histogram = |counts: &[u32; DESCRIPTOR_LEN + 1]| {
+        let mut histogram = std::array::from_fn(|k| counts[k] as f32);
+        normalise_histograms(&mut histogram);
+        histogram
+    };
+    counts.par_iter().map(histogram).collect()
+}
+
+/// The bins of a point's angles with each of some neighbours.
+fn pair_bins_with(me: usize, near: &[(u32, f32)], points: &[Point], normals: &[Point]) -> Vec<(u32, Bins)> {
     let mut block = Neighbors::default();
+    let mut found = Vec::with_capacity(near.len());
     for near in near.chunks(LANES) {
         for (lane, &(other, square)) in near.iter().enumerate() {
             let other = other as usize;
@@ -75,16 +104,14 @@ fn simplified_histogram(me: usize, near: &[(u32, f32)], points: &[Point], normal
             block.square[lane] = square;
         }
         pair_bins(&normals[me], &mut block);
-        for bins in &block.bins {
-            for bin in &bins[..near.len()] {
-                counts[(*bin as usize).min(DESCRIPTOR_LEN)] += 1.0;
-            }
-        }
+        let bins = |lane: usize| block.bins.map(|part| part[lane] as u8);
+        found.extend(near.iter().enumerate().map(|(lane, (other, _))| (*other, bins(lane))));
     }
-    let mut histogram = std::array::from_fn(|k| counts[k]);
-    normalise_histograms(&mut histogram);
-    histogram
+    found
 }
+
+/// The numbers of the descriptor that the three angles of a pair fall into, or [`DESCRIPTOR_LEN`] for none.
+type Bins = [u8; 3];
 
 /// Neighbours of a point that are taken together.
 const LANES: usize = 16;
@@ -97,7 +124,7 @@ struct Neighbors {
     /// Square of that distance, square metres.
     square: [f32; LANES],
     normal: [[f32; LANES]; 3],
-    /// The result: the numbers of the descriptor that the three angles of each fall into, or [`DESCRIPTOR_LEN`] for none.
+    /// The result: [`Bins`] of each.
     bins: [[u32; LANES]; 3],
 }
 

@@ -5,11 +5,14 @@ use multiversion::multiversion;
 use rand::Rng;
 use rayon::prelude::*;
 
-use super::fpfh::{DESCRIPTOR_LEN, Descriptor};
+use super::fpfh::Descriptor;
+use super::similarity::Columns;
 use crate::control::SeedRng;
 
 /// Descriptors, evenly spread over the scan, that stand for all when density is estimated. A multiple of `LANES`.
 const REFERENCES: usize = 512;
+/// Descriptors that are compared with them at a time.
+const TOGETHER: usize = 24;
 const LANES: usize = 16;
 /// Two descriptors count as alike up to about this Hellinger similarity short of 1.
 const KERNEL_WIDTH: f32 = 0.16;
@@ -44,35 +47,25 @@ fn densities(descriptors: &[Descriptor]) -> Vec<f32> {
     if descriptors.is_empty() {
         return Vec::new();
     }
-    // Column k holds coordinate k of all references; repeated, where there are fewer points than references.
-    let mut columns = vec![[0.0_f32; REFERENCES]; DESCRIPTOR_LEN];
-    for slot in 0..REFERENCES {
-        let reference = &descriptors[slot * descriptors.len() / REFERENCES];
-        for (column, x) in columns.iter_mut().zip(reference) {
-            column[slot] = *x;
+    // Repeated, where there are fewer points than references.
+    let reference = |slot: usize| descriptors[slot * descriptors.len() / REFERENCES];
+    let references = Columns::new((0..REFERENCES).map(reference).collect::<Vec<_>>().as_flattened());
+    let density = |descriptor: &Descriptor, similarity: &[f32; REFERENCES]| {
+        if descriptor.iter().all(|x| *x == 0.0) {
+            return f32::INFINITY;
         }
-    }
+        likeness(similarity) / REFERENCES as f32
+    };
+    let room = || vec![[0.0_f32; REFERENCES]; TOGETHER];
     descriptors
-        .par_iter()
-        .map(|descriptor| {
-            if descriptor.iter().all(|x| *x == 0.0) {
-                return f32::INFINITY;
-            }
-            let mut similarity = [0.0_f32; REFERENCES];
-            similarities(descriptor, &columns, &mut similarity);
-            likeness(&similarity) / REFERENCES as f32
+        .par_chunks(TOGETHER)
+        .map_init(room, |similarities, descriptors| {
+            references.multiply(descriptors.as_flattened(), similarities.as_flattened_mut());
+            let found = descriptors.iter().zip(similarities);
+            found.map(|(descriptor, similarity)| density(descriptor, similarity)).collect::<Vec<_>>()
         })
+        .flatten_iter()
         .collect()
-}
-
-/// The dot products of a descriptor with all references.
-#[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
-fn similarities(descriptor: &Descriptor, columns: &[[f32; REFERENCES]], similarity: &mut [f32; REFERENCES]) {
-    for (x, column) in descriptor.iter().zip(columns) {
-        for (sum, reference) in similarity.iter_mut().zip(column) {
-            *sum += x * reference;
-        }
-    }
 }
 
 /// The sum of a kernel of finite reach, close to `exp(-8 (1 - s) / KERNEL_WIDTH)`.
@@ -94,6 +87,7 @@ fn likeness(similarity: &[f32; REFERENCES]) -> f32 {
 mod tests {
     use super::*;
     use crate::control::Seed;
+    use crate::features::DESCRIPTOR_LEN;
 
     /// A descriptor of one bin, a little blurred.
     fn kind(bin: usize, blur: f32) -> Descriptor {

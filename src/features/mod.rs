@@ -11,6 +11,7 @@ mod range_image;
 mod resolution;
 mod sensor;
 mod signature;
+mod similarity;
 
 pub use fine::FineSurface;
 pub use fpfh::{DESCRIPTOR_LEN, Descriptor, fpfh};
@@ -21,3 +22,4 @@ pub use range_image::{RangeImage, Visibility};
 pub use resolution::{choose_resolution, extent, natural_resolution};
 pub use sensor::{SensorPosition, Stance, Surfaces, Viewpoint, viewpoint};
 pub use signature::{SIGNATURE_LEN, signature};
+pub use similarity::Columns;

@@ -1,8 +1,9 @@
 //! Fixed-radius neighbours of points.
 //!
-//! Points lie sorted by the cells of a regular grid about as wide as the radius asked for, one array a coordinate: the cells around a query
-//! are then a few runs of points, whose distances are computed many at once. For neighbourhoods of tens of points this is
-//! several times faster than a kd-tree, which takes a branch for every few points. Queries of one cell have their runs in common.
+//! Points lie sorted by the cells of a regular grid about as wide as the radius asked for: the cells around a query are then a few runs of
+//! points. For neighbourhoods of tens of points this is several times faster than a kd-tree, which takes a branch for every few points.
+//! Queries of one cell have their surroundings in common: those points are copied side by side, one array a coordinate, and their distances
+//! computed many at once.
 
 use std::ops::Range;
 
@@ -12,10 +13,12 @@ use rayon::prelude::*;
 use super::Point;
 use super::voxel_grid::{cell_of, sorted_by_cell};
 
-/// Points of a run that are looked at together.
+/// Points that are looked at together.
 const BLOCK: usize = 64;
-/// Points whose moments are summed side by side.
+/// Points whose moments are summed side by side. A block is a multiple of it.
 const LANES: usize = 16;
+/// Nothing is near it.
+const NOWHERE: f32 = f32::INFINITY;
 
 /// The points of one scan, sorted for lookups.
 pub struct NeighborIndex {
@@ -40,11 +43,16 @@ pub struct Moments {
 }
 
 /// The points around the queries of one cell.
-pub struct Surroundings<'i> {
-    index: &'i NeighborIndex,
-    runs: Vec<Range<usize>>,
+#[derive(Default)]
+pub struct Surroundings {
+    /// One array a coordinate, filled up with points that are nowhere.
+    position: [Vec<f32>; 3],
+    /// Which point each is, in the order of the index.
+    item: Vec<u32>,
     /// Metres.
     radius: f32,
+    /// Where the cells of each x began that were looked up last: those of the next query are near.
+    columns: Vec<usize>,
 }
 
 impl NeighborIndex {
@@ -87,15 +95,15 @@ impl NeighborIndex {
         &self,
         queries: &[Point],
         radius: f32,
-        answer: impl Fn(usize, &Surroundings<'_>) -> T + Sync,
+        answer: impl Fn(usize, &Surroundings) -> T + Sync,
     ) -> Vec<T> {
         let order = sorted_by_cell(queries, self.size);
         let groups: Vec<&[([i64; 3], u32)]> = order.chunk_by(|a, b| a.0 == b.0).collect();
         let answered: Vec<Vec<(u32, T)>> = groups
             .par_iter()
-            .map(|group| {
-                let around = self.around(group.iter().map(|(_, query)| &queries[*query as usize]), radius);
-                group.iter().map(|(_, query)| (*query, answer(*query as usize, &around))).collect()
+            .map_init(Surroundings::default, |around, group| {
+                around.fill(self, group.iter().map(|(_, query)| &queries[*query as usize]), radius);
+                group.iter().map(|(_, query)| (*query, answer(*query as usize, around))).collect()
             })
             .collect();
         let mut answers: Vec<(u32, T)> = answered.into_iter().flatten().collect();
@@ -103,54 +111,96 @@ impl NeighborIndex {
         answers.into_iter().map(|(_, answer)| answer).collect()
     }
 
-    /// The points in the cells that `radius` metres around any of these places touch.
-    fn around<'p>(&self, places: impl IntoIterator<Item = &'p Point>, radius: f32) -> Surroundings<'_> {
-        let (mut low, mut high) = ([i64::MAX; 3], [i64::MIN; 3]);
-        for place in places {
-            let (from, to) = (
-                cell_of(&place.map(|x| x - radius), self.size),
-                cell_of(&place.map(|x| x + radius), self.size),
-            );
-            for k in 0..3 {
-                low[k] = low[k].min(from[k]);
-                high[k] = high[k].max(to[k]);
-            }
+    /// What lies within `radius` metres of any of the places.
+    fn around<'p>(&self, places: impl IntoIterator<Item = &'p Point>, radius: f32) -> Surroundings {
+        let mut around = Surroundings::default();
+        around.fill(self, places, radius);
+        around
+    }
+
+    /// Where the points of a cell begin, or of the one after the last.
+    fn begin(&self, cell: usize) -> usize {
+        self.cells.get(cell).map_or(self.item.len(), |(_, begin)| *begin)
+    }
+
+    /// The number of the first cell that is not before `cell`, sought from a guess: close to it in few steps.
+    fn first_cell(&self, cell: [i64; 3], guess: usize) -> usize {
+        let is_before = |at: usize| self.cells[at].0 < cell;
+        let guess = guess.min(self.cells.len());
+        let (mut low, mut high, mut step) = (guess, guess, 1);
+        // All before `low` come before the cell, none from `high` on does.
+        while low > 0 && !is_before(low - 1) {
+            high = low - 1;
+            low = low.saturating_sub(step);
+            step *= 2;
         }
-        let mut runs = Vec::with_capacity(9);
-        for x in low[0]..=high[0] {
-            for y in low[1]..=high[1] {
-                // Cells that differ in z alone follow each other.
-                let first = self.cells.partition_point(|(cell, _)| *cell < [x, y, low[2]]);
-                let after = &self.cells[first..];
-                let count = after.iter().take_while(|(cell, _)| *cell <= [x, y, high[2]]).count();
-                if count > 0 {
-                    runs.push(after[0].1..after.get(count).map_or(self.item.len(), |(_, begin)| *begin));
-                }
-            }
+        while high < self.cells.len() && is_before(high) {
+            low = high + 1;
+            high = (high + step).min(self.cells.len());
+            step *= 2;
         }
-        Surroundings { index: self, runs, radius }
+        low + self.cells[low..high].partition_point(|(other, _)| *other < cell)
     }
 }
 
-impl Surroundings<'_> {
+impl Surroundings {
+    /// Becomes what lies around places. The buffers are used again.
+    fn fill<'p>(&mut self, index: &NeighborIndex, places: impl IntoIterator<Item = &'p Point>, radius: f32) {
+        let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
+        for place in places {
+            for k in 0..3 {
+                low[k] = low[k].min(place[k] - radius);
+                high[k] = high[k].max(place[k] + radius);
+            }
+        }
+        self.radius = radius;
+        self.item.clear();
+        self.position.iter_mut().for_each(Vec::clear);
+        let (low, high) = (cell_of(&low, index.size), cell_of(&high, index.size));
+        for (column, x) in (low[0]..=high[0]).enumerate() {
+            if column == self.columns.len() {
+                self.columns.push(0);
+            }
+            let mut at = self.columns[column];
+            for y in low[1]..=high[1] {
+                at = index.first_cell([x, y, low[2]], at);
+                if y == low[1] {
+                    self.columns[column] = at;
+                }
+                // Cells that differ in z alone follow each other.
+                let begin = at;
+                at += index.cells[at..].iter().take_while(|(cell, _)| *cell <= [x, y, high[2]]).count();
+                self.take(index, index.begin(begin)..index.begin(at));
+            }
+        }
+        let filled = self.item.len().next_multiple_of(LANES);
+        self.position.iter_mut().for_each(|axis| axis.resize(filled, NOWHERE));
+    }
+
+    /// Adds a run of points.
+    fn take(&mut self, index: &NeighborIndex, run: Range<usize>) {
+        self.item.extend_from_slice(&index.item[run.clone()]);
+        for (mine, all) in self.position.iter_mut().zip(&index.position) {
+            mine.extend_from_slice(&all[run.clone()]);
+        }
+    }
+
     /// Calls `visit(index, squared distance in m^2)` for every point in the radius of one of the queries that these surroundings are of.
     pub fn within(&self, point: &Point, mut visit: impl FnMut(usize, f32)) {
         let limit = self.radius * self.radius;
         let mut square = [0.0_f32; BLOCK];
         let mut near = [0_usize; BLOCK];
-        for all in &self.runs {
-            for begin in all.clone().step_by(BLOCK) {
-                let run = begin..all.end.min(begin + BLOCK);
-                let [xs, ys, zs] = self.index.position.each_ref().map(|axis| &axis[run.clone()]);
-                squares(xs, ys, zs, point, &mut square);
-                let mut len = 0;
-                for i in 0..run.len() {
-                    near[len] = i;
-                    len += usize::from(square[i] < limit);
-                }
-                for &i in &near[..len] {
-                    visit(self.index.item[begin + i] as usize, square[i]);
-                }
+        let [xs, ys, zs] = self.position.each_ref().map(|axis| axis.chunks(BLOCK));
+        for (block, ((x, y), z)) in xs.zip(ys).zip(zs).enumerate() {
+            squares(x, y, z, point, &mut square);
+            // Without a branch for each: the next place is written to, but only kept for what is near.
+            let mut len = 0;
+            for i in 0..x.len() {
+                near[len] = i;
+                len += usize::from(square[i] < limit);
+            }
+            for &i in &near[..len] {
+                visit(self.item[block * BLOCK + i] as usize, square[i]);
             }
         }
     }
@@ -159,10 +209,8 @@ impl Surroundings<'_> {
     #[must_use]
     pub fn moments(&self, point: &Point) -> Moments {
         let mut lanes = [[0.0_f32; LANES]; 10];
-        for run in &self.runs {
-            let [xs, ys, zs] = self.index.position.each_ref().map(|axis| &axis[run.clone()]);
-            add_moments(xs, ys, zs, point, self.radius * self.radius, &mut lanes);
-        }
+        let [xs, ys, zs] = self.position.each_ref().map(Vec::as_slice);
+        add_moments(xs, ys, zs, point, self.radius * self.radius, &mut lanes);
         let total = |k: usize| lanes[k].iter().map(|x| f64::from(*x)).sum::<f64>();
         Moments {
             count: total(0) as usize,
@@ -172,22 +220,14 @@ impl Surroundings<'_> {
     }
 }
 
-/// Adds the points of a run whose squared distance is below `limit` to the count, the three sums and the six products, lane by lane.
+/// Adds the points whose squared distance is below `limit` to the count, the three sums and the six products, lane by lane.
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
 fn add_moments(x: &[f32], y: &[f32], z: &[f32], point: &Point, limit: f32, lanes: &mut [[f32; LANES]; 10]) {
-    let n = x.len().min(y.len()).min(z.len());
     let mut sums = *lanes;
-    for begin in (0..n).step_by(LANES) {
-        // What is missing in the last block is far away.
-        let mut block = [[f32::INFINITY; LANES]; 3];
-        for (block, axis) in block.iter_mut().zip([x, y, z]) {
-            match axis.get(begin..begin + LANES) {
-                Some(whole) => block.copy_from_slice(whole),
-                None => block[..n - begin].copy_from_slice(&axis[begin..n]),
-            }
-        }
+    let [x, y, z] = [x, y, z].map(|axis| axis.as_chunks::<LANES>().0);
+    for ((x, y), z) in x.iter().zip(y).zip(z) {
         for k in 0..LANES {
-            let [dx, dy, dz] = [block[0][k] - point[0], block[1][k] - point[1], block[2][k] - point[2]];
+            let [dx, dy, dz] = [x[k] - point[0], y[k] - point[1], z[k] - point[2]];
             let near = dx * dx + dy * dy + dz * dz < limit;
             let [dx, dy, dz, one] = [dx, dy, dz, 1.0].map(|v| if near { v } else { 0.0 });
             let terms = [one, dx, dy, dz, dx * dx, dx * dy, dx * dz, dy * dy, dy * dz, dz * dz];
@@ -199,7 +239,7 @@ fn add_moments(x: &[f32], y: &[f32], z: &[f32], point: &Point, limit: f32, lanes
     *lanes = sums;
 }
 
-/// Squared distances of a run of points from one.
+/// Squared distances of points from one.
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
 fn squares(x: &[f32], y: &[f32], z: &[f32], point: &Point, square: &mut [f32; BLOCK]) {
     let n = x.len().min(BLOCK);

@@ -216,22 +216,25 @@ impl BitGraph {
     /// Matches in the order in which hypotheses are grown from them: alternately by the leading eigenvector of the graph and
     /// by the sum of second-order scores.
     fn seed_order(&self) -> Vec<usize> {
+        let neighbors: Vec<Vec<u32>> =
+            (0..self.size).map(|i| self.neighbors(i).map(|j| j as u32).collect()).collect();
         let mut vector = vec![1.0_f64; self.size];
         for _ in 0..POWER_ITERATIONS {
-            let next: Vec<f64> =
-                (0..self.size).map(|i| self.neighbors(i).map(|j| vector[j]).sum::<f64>()).collect();
+            let next: Vec<f64> = neighbors.iter().map(|of| sum_of(&vector, of)).collect();
             let norm = next.iter().map(|x| x * x).sum::<f64>().sqrt();
             if norm == 0.0 {
                 break;
             }
             vector = next.iter().map(|x| x / norm).collect();
         }
-        let second_order: Vec<f64> = (0..self.size)
-            .map(|i| {
-                let row = self.row(i);
-                f64::from(self.neighbors(i).map(|j| common(row, self.row(j))).sum::<u32>())
-            })
-            .collect();
+        let mut second_order = vec![0.0_f64; self.size];
+        for (i, of) in neighbors.iter().enumerate() {
+            for j in of.iter().map(|j| *j as usize).take_while(|j| *j < i) {
+                let score = f64::from(common(self.row(i), self.row(j)));
+                second_order[i] += score;
+                second_order[j] += score;
+            }
+        }
         let ranked = |score: &[f64]| {
             let mut order: Vec<usize> = (0..self.size).collect();
             order.sort_by(|&x, &y| score[y].total_cmp(&score[x]).then(x.cmp(&y)));
@@ -255,6 +258,17 @@ impl BitGraph {
         set.push((seed, f64::from(top)));
         set
     }
+}
+
+/// The sum of some numbers of a vector, four at a time: one sum would wait for each addition.
+fn sum_of(vector: &[f64], which: &[u32]) -> f64 {
+    let mut sums = [0.0; 4];
+    for some in which.chunks(4) {
+        for (sum, i) in sums.iter_mut().zip(some) {
+            *sum += vector[*i as usize];
+        }
+    }
+    sums.iter().sum()
 }
 
 fn pack(flags: &[u8]) -> u64 {

@@ -2,11 +2,10 @@
 
 use multiversion::multiversion;
 
-use crate::features::{DESCRIPTOR_LEN, PreparedScan};
+use crate::features::{Columns, DESCRIPTOR_LEN, PreparedScan};
 
-/// Rows of the similarity matrix computed at a time: a block of 256 x 2000 floats stays near, and the descriptors of the other scan,
-/// which the product sorts anew for every block, are sorted seldom.
-const BLOCK: usize = 256;
+/// Rows of the similarity matrix computed at a time: 12 x 2000 floats stay near until their bests are found.
+const BLOCK: usize = 12;
 /// Rows taken together into the columns' bests, so that those pass through the cache once for all of them.
 const TOGETHER: usize = 4;
 /// Less than any similarity that counts.
@@ -39,17 +38,19 @@ pub(super) fn mutual(a: &[f32], b: &[f32], limit: usize) -> Vec<Match> {
     }
     let mut by_column = Best::new(columns);
     let mut by_row: Vec<RowBest> = Vec::with_capacity(rows);
-    let mut block = vec![0.0_f32; BLOCK * columns];
+    let across = Columns::new(b);
+    let mut block = vec![0.0_f32; BLOCK * across.stride()];
     let nothing = vec![NOTHING; columns];
-    for first in (0..rows).step_by(BLOCK) {
-        let height = BLOCK.min(rows - first);
-        similarities(&a[first * DESCRIPTOR_LEN..], b, height, columns, &mut block);
+    for (some, rows) in a.chunks(BLOCK * DESCRIPTOR_LEN).enumerate() {
+        across.multiply(rows, &mut block);
+        let height = rows.len() / DESCRIPTOR_LEN;
         for row in (0..height).step_by(TOGETHER) {
             let lines: [&[f32]; TOGETHER] = std::array::from_fn(|k| {
-                if row + k < height { &block[(row + k) * columns..(row + k + 1) * columns] } else { &nothing }
+                let line = (row + k) * across.stride();
+                if row + k < height { &block[line..line + columns] } else { &nothing }
             });
             by_row.extend(lines.iter().take(height - row).map(|line| RowBest::of(line)));
-            by_column.update(lines, (first + row) as u32);
+            by_column.update(lines, (some * BLOCK + row) as u32);
         }
     }
     let mut matches: Vec<Match> = Vec::with_capacity(rows.min(columns));
@@ -70,33 +71,6 @@ pub(super) fn mutual(a: &[f32], b: &[f32], limit: usize) -> Vec<Match> {
 /// Distance ratio of two similarities of unit vectors: |x - y|^2 = 2 - 2 x.y.
 fn ratio(best: f32, second: f32) -> f32 {
     ((1.0 - best).max(0.0) / (1.0 - second).max(1e-6)).min(1.0).sqrt()
-}
-
-/// `block[i][j] = a_i . b_j` for `height` rows of `a`.
-#[expect(unsafe_code, reason = "the matrix product takes pointers; the lengths are asserted first")]
-fn similarities(a: &[f32], b: &[f32], height: usize, columns: usize, block: &mut [f32]) {
-    assert!(a.len() >= height * DESCRIPTOR_LEN && b.len() >= columns * DESCRIPTOR_LEN);
-    assert!(block.len() >= height * columns);
-    let len = DESCRIPTOR_LEN as isize;
-    // SAFETY: the asserts above keep every access of the product, rows of `len` floats one after the other, inside its slice.
-    unsafe {
-        matrixmultiply::sgemm(
-            height,
-            DESCRIPTOR_LEN,
-            columns,
-            1.0,
-            a.as_ptr(),
-            len,
-            1,
-            b.as_ptr(),
-            1,
-            len,
-            0.0,
-            block.as_mut_ptr(),
-            columns as isize,
-            1,
-        );
-    }
 }
 
 /// The two largest values of a row.
@@ -158,7 +132,8 @@ fn update_columns(
 
 #[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
 fn top_two(line: &[f32]) -> (f32, f32) {
-    const LANES: usize = 16;
+    // So many that the comparisons of one chunk do not wait for those of the last.
+    const LANES: usize = 64;
     let mut best = [NOTHING; LANES];
     let mut second = [NOTHING; LANES];
     let mut chunks = line.chunks_exact(LANES);

@@ -24,7 +24,7 @@ pub use dense::{Counts, look, quick_overlap};
 pub use gravity::{is_level, is_upright};
 pub use icp::{icp, perturbed_about};
 pub use matching::{Match, mutual_matches};
-pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair};
+pub use pair::{Hypothesis, PairKey, PairResult, inlier_matches, match_pair, match_pair_in_full};
 pub use planar::planar_poses;
 pub use probe::{Probe, probe};
 pub use second_look::{is_clearly_worse, look_finely, look_leniently, preference};

@@ -19,6 +19,10 @@ use crate::geometry::Pose;
 const MAX_MATCHES: usize = 800;
 /// Poses that are refined and verified, the most promising at a glance.
 const REFINED: usize = 6;
+/// Points of each scan, about, by which a refined pose is judged first, …
+const GLANCED: usize = 1500;
+/// … and log-odds below which that is enough. Of a thousand such poses none looked likelier right than wrong at all points.
+const HOPELESS: f64 = -5.0;
 /// Refined poses closer than this (rad, voxels) are one hypothesis.
 const SAME_ANGLE: f64 = 0.085;
 const SAME_VOXELS: f64 = 2.5;
@@ -62,9 +66,20 @@ pub struct PairResult {
     pub hypotheses: Vec<Hypothesis>,
 }
 
-/// Matches and verifies one pair. `x` and `y` may come in either order and must be different scans at one resolution.
+/// Matches and verifies one pair. `x` and `y` may come in either order and must be different scans at one resolution. The evidence for
+/// poses that are hopeless is counted on some of the points.
 #[must_use]
 pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
+    match_and_verify(x, y, verifier, HOPELESS)
+}
+
+/// The same with all evidence counted on all points, whatever the verifier makes of it: what one is fitted to.
+#[must_use]
+pub fn match_pair_in_full(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
+    match_and_verify(x, y, verifier, f64::NEG_INFINITY)
+}
+
+fn match_and_verify(x: &Scan, y: &Scan, verifier: &Verifier, hopeless: f64) -> PairResult {
     let (a, b) = if x.key() < y.key() { (x, y) } else { (y, x) };
     let pair = PairKey { a: a.key(), b: b.key() };
     let matches = mutual_matches(&a.prepared, &b.prepared, MAX_MATCHES);
@@ -79,17 +94,23 @@ pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
             continue;
         }
         let agreeing = agreement(a, b, &matches, &a_from_b);
-        let evidence = Evidence {
-            b_on_a: look(a, b, &a_from_b, 1),
-            a_on_b: look(b, a, &a_from_b.inverse(), 1),
-            consensus: agreeing.score.max(candidate.score) as f32,
-            match_inliers: agreeing.inliers as u32,
-            matches: matches.len() as u32,
-            range_images: [a, b].iter().filter(|scan| scan.prepared.range_image.is_some()).count() as u32,
-            appearance: appearance(a, b, &a_from_b),
+        let appearance = appearance(a, b, &a_from_b);
+        let verified = |points: usize| {
+            let stride = |scan: &Scan| scan.prepared.points.len() / points;
+            let evidence = Evidence {
+                b_on_a: look(a, b, &a_from_b, stride(b)),
+                a_on_b: look(b, a, &a_from_b.inverse(), stride(a)),
+                consensus: agreeing.score.max(candidate.score) as f32,
+                match_inliers: agreeing.inliers as u32,
+                matches: matches.len() as u32,
+                range_images: [a, b].iter().filter(|scan| scan.prepared.range_image.is_some()).count() as u32,
+                appearance,
+            };
+            let logit = verifier.pair_logit(&evidence, a.prepared.resolution);
+            Hypothesis { a_from_b, evidence, logit }
         };
-        let logit = verifier.pair_logit(&evidence, a.prepared.resolution);
-        hypotheses.push(Hypothesis { a_from_b, evidence, logit });
+        let glanced = Some(verified(GLANCED)).filter(|at_a_glance| at_a_glance.logit < hopeless);
+        hypotheses.push(glanced.unwrap_or_else(|| verified(usize::MAX)));
     }
     contest(a, b, &mut hypotheses);
     hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));
@@ -112,4 +133,55 @@ pub fn inlier_matches<'m>(
         })
         .collect();
     matches.iter().zip(keep).filter_map(|(m, keep)| keep.then_some(*m))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::control::Seed;
+    use crate::pairwise::shipped_verifier;
+    use crate::pairwise::test_survey::prepared;
+    use crate::simulate::{Sensor, SurveyOptions, simulate};
+
+    #[test]
+    fn only_what_is_hopeless_is_judged_by_some_of_the_points() {
+        let office = simulate(&SurveyOptions {
+            sensor: Sensor::panoramic(20_000),
+            stations: 6,
+            least_overlap: 0.1,
+            seed: Seed(5),
+            ..SurveyOptions::default()
+        })
+        .expect("the options are valid");
+        let scans = prepared(&office, 0.15);
+        let verifier = shipped_verifier();
+        let (mut glanced, mut looked_at) = (0, 0);
+        for (i, (a, _)) in scans.iter().enumerate() {
+            for (b, _) in &scans[..i] {
+                let quick = match_pair(a, b, &verifier);
+                let full = match_pair_in_full(a, b, &verifier);
+                assert_eq!(
+                    (quick.matches.len(), quick.hypotheses.len()),
+                    (full.matches.len(), full.hypotheses.len())
+                );
+                for known in &full.hypotheses {
+                    let same = |h: &&Hypothesis| h.a_from_b == known.a_from_b;
+                    let found = quick.hypotheses.iter().find(same).expect("the poses are the same");
+                    if found.evidence == known.evidence {
+                        looked_at += 1;
+                    } else {
+                        assert!(found.evidence.both().points < known.evidence.both().points / 2);
+                        assert!(
+                            found.logit < HOPELESS && known.logit < 0.0,
+                            "{} is {}",
+                            found.logit,
+                            known.logit
+                        );
+                        glanced += 1;
+                    }
+                }
+            }
+        }
+        assert!(glanced > 20 && looked_at > 20, "{glanced} poses were hopeless, {looked_at} not");
+    }
 }
