@@ -7,7 +7,7 @@ use super::gravity::Gravity;
 use super::join::{SINGLE_STARTS, ViolationLimit, pooled_fit, violation_of};
 use super::options::{JoinLevel, MappingOptions};
 use super::refine::{Reach, dense, pose_graph};
-use super::surfaces::judge;
+use super::surfaces::{align, judge};
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;
 use crate::graph::ScanGraph;
@@ -31,9 +31,28 @@ pub fn bent_join(
     if candidate.margin(options) < level.support {
         return Ok(None);
     }
+    let limit = ViolationLimit::new(graph, (a, b), level, options);
+    let several = options.asks_for_several(a.len(), b.len(), level);
+    let fits = |joined: &Component| {
+        let part = |of: &Component| {
+            let mut part = of.clone();
+            part.poses.retain(|key, pose| joined.poses.get(key).map(|moved| *pose = *moved).is_some());
+            part
+        };
+        let (x, y) = (part(a), part(b));
+        let still = Pose::identity();
+        let kept = support_of(graph, &x, &y, &still, voxel, options);
+        kept.support >= level.support
+            && (kept.edges > 1 || !several)
+            && !options.decisions.forbids(graph, &x, &y, &still, options)
+            && Gravity::between(graph, &x, &y).is_none_or(|gravity| gravity.admits(&still))
+            && violation_of(&judge(graph, &x, &y, &still)) <= LENIENCE * limit.share(candidate.support)
+    };
     let mut joined = a.clone();
     joined.absorb(b.clone(), &clearest_start(graph, (a, b), candidate, voxel), graph, options);
     let before = joined.clone();
+    // Adjustment straightens what is bent, but where it is bent more than surfaces reach it can pull them past each other.
+    let mut fitting = fits(&joined).then(|| joined.clone());
     pose_graph(graph, &mut joined, Reach::FAR, voxel, options, control)?;
     for _ in 0..DENSE_ROUNDS {
         dense(graph, &mut joined, None, Reach::FAR, voxel, control)?;
@@ -41,24 +60,13 @@ pub fn bent_join(
     if !thrown(graph, &before, &joined, options).is_empty() {
         return Ok(None);
     }
-    let part = |of: &Component| {
-        let mut part = of.clone();
-        part.poses.retain(|key, pose| joined.poses.get(key).map(|moved| *pose = *moved).is_some());
-        part
-    };
-    let (x, y) = (part(a), part(b));
-    let found = violation_of(&judge(graph, &x, &y, &Pose::identity()));
-    let limit = ViolationLimit::new(graph, (a, b), level, options);
-    let banned = options.decisions.forbids(graph, &x, &y, &Pose::identity(), options);
-    let kept = support_of(graph, &x, &y, &Pose::identity(), voxel, options);
-    let several = options.asks_for_several(a.len(), b.len(), level);
-    let backed = kept.support >= level.support && (kept.edges > 1 || !several);
-    let tips_over = Gravity::between(graph, &x, &y).is_some_and(|gravity| !gravity.admits(&Pose::identity()));
-    let allowed = found <= LENIENCE * limit.share(candidate.support);
-    Ok((!banned && !tips_over && allowed && backed).then_some(joined))
+    if fits(&joined) {
+        fitting = Some(joined);
+    }
+    Ok(fitting)
 }
 
-/// Of the fit to all edges and the poses of single edges, the one that is most clear of free space. The fit lies where the adjustment
+/// Of the fit to all edges and the poses of single edges, as they are and aligned, the one that is most clear of free space. The fit lies where the adjustment
 /// cannot return from when the edges differ by more than they are wide.
 fn clearest_start(
     graph: &ScanGraph,
@@ -70,10 +78,12 @@ fn clearest_start(
     let fit = pooled_fit(graph, a, b, candidate, voxel);
     let single = candidate.members.iter().take(SINGLE_STARTS).map(|member| member.a_from_b);
     let mut best = (violation(&fit), fit);
-    for start in single {
-        let found = violation(&start);
-        if found < best.0 {
-            best = (found, start);
+    for start in std::iter::once(fit).chain(single) {
+        for pose in [start, align(graph, a, b, &start, voxel)] {
+            let found = violation(&pose);
+            if found < best.0 {
+                best = (found, pose);
+            }
         }
     }
     best.1

@@ -55,10 +55,8 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
         self.part(graph, options, control, |component, supports| loose_side(component, supports, least))?;
-        self.refused.clear();
-        self.filtered.clear();
+        self.forget_setbacks();
         self.doubted.clear();
-        self.set_aside.clear();
         self.undone.clear();
         for refusal in self.waiting.values_mut() {
             // What was taken back then is no verdict on what is decided now.
@@ -67,6 +65,13 @@ impl Mapper {
         self.dissolve_small();
         self.sort_components();
         Ok(())
+    }
+
+    /// Lets everything that was refused, filtered or set aside be tried again.
+    pub fn forget_setbacks(&mut self) {
+        self.refused.clear();
+        self.filtered.clear();
+        self.set_aside.clear();
     }
 
     /// Parts components at their bridges that are not firm, and where one scan alone sees little of a piece.

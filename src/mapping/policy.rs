@@ -31,8 +31,10 @@ pub fn grow(
 ) -> Result<(), Cancelled> {
     let mut rounds = 0;
     let mut undone = 0;
+    let told = options;
     let mut options = options.clone();
     let mut weakly = false;
+    let mut is_last = false;
     loop {
         let levels = if !mapper.doubted.is_empty() {
             options.strictest_level()
@@ -71,6 +73,11 @@ pub fn grow(
             }
         } else if !weakly {
             weakly = true;
+        } else if !is_last && mapper.doubted.is_empty() && (undone > 0 || !mapper.set_aside.is_empty()) {
+            // What was torn apart or set aside was so when less was known of what surrounds it: all is asked once more.
+            is_last = true;
+            options.decisions = told.decisions.clone();
+            mapper.forget_setbacks();
         } else {
             break;
         }
@@ -110,4 +117,33 @@ fn join_all(
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cloud::ScanKey;
+    use crate::control::{CancelToken, Silent};
+    use crate::mapping::component::Component;
+    use crate::mapping::test_hall::Model;
+    use crate::mapping::tracks::Tracks;
+
+    #[test]
+    fn what_was_set_aside_is_asked_once_more_when_nothing_else_fits() {
+        let model = Model::new(8);
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let mut poses = model.component.poses.clone();
+        poses.remove(&ScanKey(8));
+        let rest = Component { gauge: ScanKey(1), poses, tracks: Tracks::default() };
+        let mut mapper = Mapper { components: vec![rest], ..Mapper::default() };
+        mapper.add_waiting(ScanKey(8));
+        mapper.set_aside.insert(ScanKey(8));
+        let (mut graph, options, mut pairs) = (model.graph.clone(), MappingOptions::default(), Vec::new());
+        let total = model.component.len();
+        grow(&mut mapper, &mut graph, model.hall.resolution, &options, &mut pairs, control)
+            .expect("nobody cancels");
+        assert!(mapper.set_aside.is_empty() && mapper.waiting.is_empty());
+        assert_eq!(mapper.components.iter().map(Component::len).collect::<Vec<_>>(), [total]);
+    }
 }
