@@ -10,7 +10,7 @@ const WIDTH: usize = 32;
 const ROWS: usize = 6;
 const VECTORS: usize = 2;
 
-/// Descriptors as columns of products: coordinate after coordinate for every [`WIDTH`] of them, zeros in place of those that are missing.
+/// Descriptors as columns of products: coordinate after coordinate for every 32 of them, zeros in place of those that are missing.
 #[derive(Debug, Clone)]
 pub struct Columns {
     panels: Vec<[[f32; WIDTH]; DESCRIPTOR_LEN]>,
