@@ -40,6 +40,7 @@ impl Columns {
 
     /// The dot products of other descriptors with these, a row of [`Columns::stride`] numbers for each of them. `products` has room for all.
     pub fn multiply(&self, rows: &[f32], products: &mut [f32]) {
+        assert!(products.len() >= rows.len() / DESCRIPTOR_LEN * self.stride());
         Arch::new().dispatch(Product { rows, columns: self, products });
     }
 }
@@ -102,7 +103,7 @@ fn tile<S: Simd>(
         for (sums, row) in sums.iter_mut().zip(rows) {
             let x = simd.splat_f32s(row[k]);
             for (sum, column) in sums.iter_mut().zip(columns) {
-                *sum = simd.mul_add_f32s(x, *column, *sum);
+                *sum = simd.mul_add_e_f32s(x, *column, *sum);
             }
         }
     }

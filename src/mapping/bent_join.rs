@@ -18,7 +18,7 @@ const LENIENCE: f64 = 1.5;
 const DENSE_ROUNDS: usize = 2;
 
 /// A join of two components that are each a little bent, so that no rigid motion fits all that they share: they are joined on
-/// trial, adjusted together, and judged as they then stand. `None` when that does not help, or when another pose is nearly as well supported.
+/// trial, adjusted together, and judged as they then stand, or as they stood before. `None` when that does not help, or when another pose is nearly as well supported.
 pub fn bent_join(
     graph: &ScanGraph,
     (a, b): (&Component, &Component),
@@ -51,7 +51,7 @@ pub fn bent_join(
     let mut joined = a.clone();
     joined.absorb(b.clone(), &clearest_start(graph, (a, b), candidate, voxel), graph, options);
     let before = joined.clone();
-    // Adjustment straightens what is bent, but where it is bent more than surfaces reach it can pull them past each other.
+    // Adjustment straightens what is bent, but where it is bent more than surfaces reach it can pull them past each other; so the start counts too.
     let mut fitting = fits(&joined).then(|| joined.clone());
     pose_graph(graph, &mut joined, Reach::FAR, voxel, options, control)?;
     for _ in 0..DENSE_ROUNDS {

@@ -17,7 +17,8 @@ use crate::control::{Cancelled, Control, Stage};
 use crate::graph::ScanGraph;
 use crate::pairwise::PairResult;
 
-/// Rounds in which contradicted joins are undone while the model grows once; after that what was undone stays apart.
+/// Rounds in which contradicted joins are undone while the model grows, and again when all is asked once more; after that what was undone
+/// stays apart.
 const MAX_UNDONE: usize = 20;
 
 /// Grows the model until nothing more fits. `pairs` collects the results of pairs that widening tried.
@@ -76,6 +77,7 @@ pub fn grow(
         } else if !is_last && mapper.doubted.is_empty() && (undone > 0 || !mapper.set_aside.is_empty()) {
             // What was torn apart or set aside was so when less was known of what surrounds it: all is asked once more.
             is_last = true;
+            undone = 0;
             options.decisions = told.decisions.clone();
             mapper.forget_setbacks();
         } else {

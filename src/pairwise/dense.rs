@@ -48,6 +48,21 @@ impl Counts {
         }
     }
 
+    /// What these counts of every `stride`-th point stand for.
+    #[must_use]
+    pub fn times(&self, stride: usize) -> Self {
+        let many = |count: u32| count.saturating_mul(u32::try_from(stride).unwrap_or(u32::MAX));
+        Self {
+            points: many(self.points),
+            inliers: many(self.inliers),
+            tight: many(self.tight),
+            wrong_normal: many(self.wrong_normal),
+            violations: many(self.violations),
+            on_seen_surface: many(self.on_seen_surface),
+            plane_square: self.plane_square * stride as f32,
+        }
+    }
+
     /// Share of the points that lie on the other's surface.
     #[must_use]
     pub fn overlap(&self) -> f64 {
