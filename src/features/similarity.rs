@@ -38,7 +38,11 @@ impl Columns {
         self.panels.len() * WIDTH
     }
 
-    /// The dot products of other descriptors with these, a row of [`Columns::stride`] numbers for each of them. `products` has room for all.
+    /// The dot products of other descriptors with these, a row of [`Columns::stride`] numbers for each of them.
+    ///
+    /// # Panics
+    ///
+    /// If `products` has no room for all.
     pub fn multiply(&self, rows: &[f32], products: &mut [f32]) {
         assert!(products.len() >= rows.len() / DESCRIPTOR_LEN * self.stride());
         Arch::new().dispatch(Product { rows, columns: self, products });
