@@ -77,13 +77,12 @@ fn clearest_start(
     let violation = |pose: &Pose| violation_of(&judge(graph, a, b, pose));
     let fit = pooled_fit(graph, a, b, candidate, voxel);
     let single = candidate.members.iter().take(SINGLE_STARTS).map(|member| member.a_from_b);
+    let aligned = |start: Pose| [start, align(graph, a, b, &start, voxel)];
     let mut best = (violation(&fit), fit);
-    for start in std::iter::once(fit).chain(single) {
-        for pose in [start, align(graph, a, b, &start, voxel)] {
-            let found = violation(&pose);
-            if found < best.0 {
-                best = (found, pose);
-            }
+    for pose in aligned(fit).into_iter().skip(1).chain(single.flat_map(aligned)) {
+        let found = violation(&pose);
+        if found < best.0 {
+            best = (found, pose);
         }
     }
     best.1

@@ -71,19 +71,21 @@ pub struct PairResult {
 /// poses that are hopeless is counted on some of the points, which stand for all.
 #[must_use]
 pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
-    match_and_verify(x, y, verifier, HOPELESS)
+    match_and_verify(x, y, verifier, true)
 }
 
 /// The same with all evidence counted on all points, whatever the verifier makes of it: what one is fitted to.
 #[must_use]
 pub fn match_pair_in_full(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
-    match_and_verify(x, y, verifier, f64::NEG_INFINITY)
+    match_and_verify(x, y, verifier, false)
 }
 
-fn match_and_verify(x: &Scan, y: &Scan, verifier: &Verifier, hopeless: f64) -> PairResult {
+fn match_and_verify(x: &Scan, y: &Scan, verifier: &Verifier, glance: bool) -> PairResult {
     let (a, b) = if x.key() < y.key() { (x, y) } else { (y, x) };
     let pair = PairKey { a: a.key(), b: b.key() };
     let matches = mutual_matches(&a.prepared, &b.prepared, MAX_MATCHES);
+    // Of small scans a glance is all there is to see.
+    let glance = glance && [a, b].iter().any(|scan| scan.prepared.points.len() >= 2 * GLANCED);
     let mut hypotheses: Vec<Hypothesis> = Vec::with_capacity(REFINED);
     for candidate in shortlist(a, b, &matches, REFINED) {
         let a_from_b = icp(a, b, &candidate.a_from_b);
@@ -113,7 +115,7 @@ fn match_and_verify(x: &Scan, y: &Scan, verifier: &Verifier, hopeless: f64) -> P
             let logit = verifier.pair_logit(&evidence, a.prepared.resolution);
             Hypothesis { a_from_b, evidence, logit }
         };
-        let glanced = Some(verified(GLANCED)).filter(|at_a_glance| at_a_glance.logit < hopeless);
+        let glanced = glance.then(|| verified(GLANCED)).filter(|at_a_glance| at_a_glance.logit < HOPELESS);
         hypotheses.push(glanced.unwrap_or_else(|| verified(usize::MAX)));
     }
     contest(a, b, &mut hypotheses);
