@@ -18,6 +18,8 @@ use crate::graph::{ScanGraph, evidence};
 const LEAST_EVIDENCE: f64 = 0.03;
 /// An edge with this evidence says something: a likelihood of 0.63.
 pub const LEAST_WORD: f64 = 1.0;
+/// A pair that third scans talk up has a voice of its own with these log-odds: a likelihood of 0.27.
+const OWN_VOICE: f64 = -1.0;
 /// Proposals that are tried as the centre of a cluster, at most.
 const MAX_CENTRES: usize = 200;
 
@@ -40,6 +42,8 @@ pub struct Proposal {
     /// What the hypothesis is worth to a rival: the same, or what the pair alone says if that is more. Third scans that are themselves
     /// misplaced can talk a score down, so a rival keeps its own word.
     pub doubt: f64,
+    /// Log-odds that its pair alone gives it.
+    pub alone: f64,
     /// Centroid of `in_b` in the frame of b, metres: where distances between poses are measured.
     pub(super) centroid: Vector3<f64>,
 }
@@ -69,6 +73,19 @@ impl Candidate {
     #[must_use]
     pub fn rests_on_several(&self) -> bool {
         self.decided || self.members.iter().filter(|member| member.evidence > LEAST_WORD).count() > 1
+    }
+
+    /// Support by pairs that have a voice of their own, or by a client: third scans that see the same surfaces repeat what one pair says.
+    #[must_use]
+    pub fn own_support(&self) -> f64 {
+        let own = self.members.iter().filter(|member| member.alone > OWN_VOICE);
+        own.map(|member| member.evidence).sum()
+    }
+
+    /// The log-odds of the pair that is surest by itself.
+    #[must_use]
+    pub fn surest(&self) -> f64 {
+        self.members.iter().map(|member| member.alone).fold(f64::NEG_INFINITY, f64::max)
     }
 
     /// Support with the rival's share taken off: what joins are ranked and judged by.
@@ -102,6 +119,7 @@ pub fn proposals(graph: &ScanGraph, a: &Component, b: &Component) -> Vec<Proposa
                         in_a_from_in_b: motion,
                         evidence: said,
                         doubt,
+                        alone: h.hypothesis.logit,
                         centroid,
                     });
                 }
@@ -208,6 +226,7 @@ fn decided(join: &DecidedJoin, graph: &ScanGraph, b: &Component) -> Candidate {
         in_a_from_in_b: join.in_a_from_in_b,
         evidence: DECIDED,
         doubt: DECIDED,
+        alone: DECIDED,
         centroid: b.poses.get(&join.in_b).and_then(place).unwrap_or_default(),
     };
     Candidate {

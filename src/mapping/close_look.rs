@@ -85,6 +85,7 @@ mod tests {
                 in_a_from_in_b: a_from_b,
                 evidence: 4.0,
                 doubt: 4.0,
+                alone: 4.0,
                 centroid: Vector3::zeros(),
             };
             Candidate { a_from_b, support: 4.0, doubt: 4.0, rival: 0.0, members: vec![member], decided }

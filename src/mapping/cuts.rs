@@ -8,6 +8,8 @@ use crate::cloud::ScanKey;
 
 /// Fewer scans are no piece: one that hangs on by a pair misplaces nothing but itself.
 const PIECE: usize = 2;
+/// Support of scans that are not to be separated.
+const INSEPARABLE: f64 = 1e12;
 /// Support below this is none.
 const NO_SUPPORT: f64 = 1e-6;
 
@@ -179,20 +181,29 @@ fn weakest_cut(mut weight: Vec<Vec<f64>>, mut groups: Vec<Vec<usize>>) -> Option
     best
 }
 
-/// The cut of least support that separates two scans of a component: the side of `from`, and the support across (Edmonds, Karp:
+/// The cut of least support that separates some scans of a component from others: the side of `from`, and the support across (Edmonds, Karp:
 /// "Theoretical improvements in algorithmic efficiency for network flow problems", JACM 1972).
 #[must_use]
 pub fn separating_cut(
     component: &Component,
     supports: &BTreeMap<(ScanKey, ScanKey), f64>,
-    from: ScanKey,
-    to: ScanKey,
+    from: &[ScanKey],
+    to: &[ScanKey],
 ) -> Option<(BTreeSet<ScanKey>, f64)> {
     let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
     let index: BTreeMap<ScanKey, usize> = keys.iter().enumerate().map(|(i, key)| (*key, i)).collect();
-    let (&source, &sink) = (index.get(&from)?, index.get(&to)?);
+    let end =
+        |scans: &[ScanKey]| scans.iter().map(|scan| index.get(scan).copied()).collect::<Option<Vec<_>>>();
+    let (sources, sinks) = (end(from)?, end(to)?);
+    let (source, sink) = (*sources.first()?, *sinks.first()?);
     let n = keys.len();
     let mut spare = vec![0.0_f64; n * n];
+    for (first, others) in [(source, &sources), (sink, &sinks)] {
+        for other in others.iter().filter(|other| **other != first) {
+            spare[first * n + other] = INSEPARABLE;
+            spare[other * n + first] = INSEPARABLE;
+        }
+    }
     for ((a, b), support) in supports {
         if let (Some(&i), Some(&j)) = (index.get(a), index.get(b)) {
             spare[i * n + j] += support;
@@ -258,12 +269,20 @@ mod tests {
         let links =
             [(1, 2, 5.0), (2, 3, 5.0), (1, 3, 5.0), (4, 5, 6.0), (5, 6, 0.1), (4, 6, 0.1), (3, 4, 1.5)];
         let supports = links.iter().map(|&(a, b, w)| ((key(a), key(b)), w)).collect();
-        let (side, cut) = separating_cut(&six(), &supports, key(1), key(5)).unwrap();
+        let (side, cut) = separating_cut(&six(), &supports, &[key(1)], &[key(5)]).unwrap();
         assert_eq!(side, BTreeSet::from([key(1), key(2), key(3)]));
         assert!((cut - 1.5).abs() < 1e-9);
-        let (side, cut) = separating_cut(&six(), &supports, key(6), key(1)).unwrap();
+        let (side, cut) = separating_cut(&six(), &supports, &[key(6)], &[key(1)]).unwrap();
         assert_eq!(side, BTreeSet::from([key(6)]));
         assert!((cut - 0.2).abs() < 1e-9);
+        let (side, cut) = separating_cut(&six(), &supports, &[key(6), key(4)], &[key(1)]).unwrap();
+        assert_eq!(
+            side,
+            BTreeSet::from([key(4), key(5), key(6)]),
+            "scan 6 alone is not all that is on that side"
+        );
+        assert!((cut - 1.5).abs() < 1e-9);
+        assert_eq!(separating_cut(&six(), &supports, &[], &[key(1)]), None);
     }
 
     #[test]

@@ -162,12 +162,11 @@ impl Case<'_> {
         let inside: Vec<&Contradiction> = testimony.inside(component).collect();
         let mut hearing: Option<Hearing<'_>> = None;
         let mut refuted: BTreeSet<BTreeSet<ScanKey>> = BTreeSet::new();
-        for strongest in inside.iter().take(TRIED) {
-            let Some((side, support)) =
-                separating_cut(component, supports, strongest.pair.a, strongest.pair.b)
-            else {
-                break;
-            };
+        let single = |c: &&Contradiction| separating_cut(component, supports, &[c.pair.a], &[c.pair.b]);
+        let singles = inside.iter().take(TRIED).filter_map(|c| Some((single(c)?, *c)));
+        // Where the first fail, all.
+        let gathered = std::iter::once(()).flat_map(|()| self.gathered(&inside));
+        for ((side, support), strongest) in singles.chain(gathered) {
             if refuted.contains(&side) {
                 continue;
             }
@@ -186,9 +185,38 @@ impl Case<'_> {
                 refuted.insert(side);
                 continue;
             }
-            return Ok(Some((smaller_side(component, side), **strongest)));
+            return Ok(Some((smaller_side(component, side), *strongest)));
         }
         Ok(None)
+    }
+
+    /// Cuts that separate more and more of the scans that contradict each other, the strongest first, each the way that costs less: between
+    /// two of them alone, a place that hangs by less may be nearer than the one that they mean.
+    fn gathered<'c>(
+        &self,
+        inside: &[&'c Contradiction],
+    ) -> Vec<((BTreeSet<ScanKey>, f64), &'c Contradiction)> {
+        let mut sides: [Vec<ScanKey>; 2] = Default::default();
+        let mut cuts = Vec::new();
+        for c in inside.iter().take(TRIED) {
+            let ways = [[c.pair.a, c.pair.b], [c.pair.b, c.pair.a]].map(|way| {
+                let mut ends = sides.clone();
+                for (end, scan) in ends.iter_mut().zip(way) {
+                    end.push(scan);
+                }
+                if ends[0].iter().any(|scan| ends[1].contains(scan)) {
+                    return None;
+                }
+                let cut = separating_cut(self.component, self.supports, &ends[0], &ends[1])?;
+                Some((cut, ends))
+            });
+            let cheapest = ways.into_iter().flatten().min_by(|x, y| x.0.1.total_cmp(&y.0.1));
+            if let Some((cut, ends)) = cheapest {
+                sides = ends;
+                cuts.push((cut, inside[0]));
+            }
+        }
+        cuts
     }
 }
 
@@ -221,5 +249,29 @@ mod tests {
         assert_eq!(settles(&model.with_turned(&[5])), Ok(true));
         assert_eq!(settles(&model.component), Ok(false));
         assert_eq!(settles(&model.with_turned(&[4, 5])), Ok(false), "scan 4 is still at the wrong end");
+    }
+
+    #[test]
+    fn all_that_contradict_are_separated_where_two_of_them_would_be_elsewhere() {
+        let model = Model::new(6);
+        let options = MappingOptions::default();
+        let key = |pair: (u128, u128)| (ScanKey(pair.0), ScanKey(pair.1));
+        // A chain: 4 to 6 hang on 1, wrongly, by more than 2 and 3 do.
+        let chain = [((1, 2), 7.5), ((2, 3), 16.0), ((1, 4), 8.5), ((4, 5), 16.0), ((5, 6), 16.0)];
+        let supports = chain.map(|(pair, support)| (key(pair), support)).into();
+        let said = [model.contradiction((3, 5), false), model.contradiction((1, 5), false)];
+        let case = Case {
+            graph: &model.graph,
+            component: &model.component,
+            supports: &supports,
+            testimony: &Testimony::default(),
+            options: &options,
+        };
+        let found = case.gathered(&said.iter().collect::<Vec<_>>());
+        let sides: Vec<Vec<u128>> =
+            found.iter().map(|((side, _), _)| side.iter().map(|scan| scan.0).collect()).collect();
+        assert_eq!(sides, [vec![2, 3], vec![1, 2, 3]]);
+        let supports = found.iter().map(|((_, support), _)| *support);
+        assert!(supports.zip([7.5, 8.5]).all(|(found, right)| (found - right).abs() < 1e-9));
     }
 }

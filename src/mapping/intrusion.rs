@@ -47,7 +47,9 @@ pub fn intrusion(
     suspicious.sort_by(|x, y| y.1.violations.cmp(&x.1.violations).then(x.0.cmp(&y.0)));
     for (pair, _) in suspicious.into_iter().take(TRIED) {
         control.check()?;
-        let Some((side, support)) = separating_cut(component, supports, pair.a, pair.b) else { continue };
+        let Some((side, support)) = separating_cut(component, supports, &[pair.a], &[pair.b]) else {
+            continue;
+        };
         let (Some((rest, part)), Some(a_from_b)) = (sides(component, &side), between(component, pair)) else {
             continue;
         };

@@ -152,6 +152,9 @@ pub fn weigh_join(
 ) -> Result<Result<Pose, Refusal>, Cancelled> {
     let mut first_refusal = None;
     let several = options.asks_for_several(a.len(), b.len(), level);
+    // What is joined already, and only weighed again, need not show as much.
+    let weighed_again = level.support <= 0.0;
+    let strictest = !weighed_again && options.is_strictest(level);
     let limit = ViolationLimit::new(graph, (a, b), level, options);
     let gravity = Gravity::between(graph, a, b);
     let place = |candidate: &Candidate, least: f64, edges: usize| {
@@ -167,21 +170,26 @@ pub fn weigh_join(
             first_refusal = first_refusal.or(Some(Refusal::SinglePair { support: candidate.support }));
             continue;
         }
+        let own = candidate.own_support();
+        if strictest && own < level.support {
+            first_refusal = first_refusal.or(Some(Refusal::Support { found: own, needed: level.support }));
+            continue;
+        }
         match place(candidate, level.support, if several { 2 } else { 1 }) {
             Ok(placed) => {
-                // What is joined already, and only weighed again, need not show as much.
-                if level.support > 0.0
+                if !weighed_again
                     && let Some(refusal) = objection(graph, (a, b), candidate, placed.edges, &placed.a_from_b)
                 {
                     first_refusal = first_refusal.or(Some(refusal));
                     continue;
                 }
                 let margin = |rival: f64| placed.support - options.rival_share * rival;
-                // Rivals are looked at only as far as they matter.
-                let feared = candidates
-                    .iter()
-                    .enumerate()
-                    .filter(|(other, c)| *other != rank && margin(c.doubt) < level.support);
+                // Rivals are looked at only as far as they matter. The pairs that one scan has with a piece are no independent witnesses: together they
+                // do not outweigh one that is surer than any of them.
+                let surest = candidate.surest();
+                let feared = candidates.iter().enumerate().filter(|(other, c)| {
+                    *other != rank && (margin(c.doubt) < level.support || c.surest() > surest)
+                });
                 for (_, rival) in feared {
                     control.check()?;
                     if let Ok(there) = place(rival, 0.0, 0)
@@ -341,4 +349,63 @@ pub fn pooled_fit(
         }
     }
     pose
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::control::{CancelToken, Silent};
+    use crate::graph::SupportOptions;
+    use crate::mapping::candidates::{CLUSTERS, candidates};
+    use crate::mapping::test_hall::Model;
+    use crate::pairwise::{Evidence, Hypothesis, PairKey, PairResult};
+
+    /// What joining the last scan to the others comes to at the levels from the strictest down, where its pairs say this: whether truly, and with
+    /// what log-odds.
+    fn joined(said: &[((u128, u128), bool, f64)]) -> Vec<Result<Pose, Refusal>> {
+        let model = Model::new(6);
+        let mut graph = model.coarse();
+        let results = said.iter().map(|&(pair, truly, logit)| {
+            let a_from_b = model.contradiction(pair, truly).a_from_b;
+            let evidence = Evidence::default();
+            PairResult {
+                pair: PairKey::of(ScanKey(pair.0), ScanKey(pair.1)),
+                matches: Vec::new(),
+                hypotheses: vec![Hypothesis { a_from_b, evidence, logit }],
+            }
+        });
+        graph.add_results(results, &SupportOptions::default());
+        let options = MappingOptions::default();
+        let mut rest = model.component.clone();
+        rest.remove(ScanKey(6), &options);
+        let last = Component::single(ScanKey(6));
+        let voxel = model.hall.resolution;
+        let found = candidates(&graph, &rest, &last, voxel, &options, CLUSTERS);
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let weigh = |level| weigh_join(&graph, (&rest, &last), &found, level, voxel, &options, control);
+        options.levels.iter().map(|level| weigh(level).expect("nobody cancels")).collect()
+    }
+
+    #[test]
+    fn what_only_third_scans_say_does_not_count_at_the_strictest_level() {
+        let talked_up = |logit| [((1, 6), true, 6.0), ((2, 6), true, logit), ((3, 6), true, logit)];
+        let by_themselves = joined(&[talked_up(6.0), [((4, 6), true, 6.0); 3]].concat());
+        assert!(by_themselves[0].is_ok(), "{by_themselves:?}");
+        let others = [((4, 6), true, -3.0), ((5, 6), true, -3.0)];
+        let one_voice = joined(&[&talked_up(-3.0)[..], &others].concat());
+        assert_eq!(one_voice[0], Err(Refusal::Support { found: 4.0, needed: 8.0 }));
+        assert!(one_voice[1].is_ok(), "{one_voice:?}");
+    }
+
+    #[test]
+    fn several_pairs_of_one_scan_do_not_outweigh_a_surer_one_elsewhere() {
+        let sure = |logit| {
+            let others =
+                [((2, 6), true, 5.0), ((3, 6), true, 5.0), ((4, 6), true, -9.0), ((5, 6), true, -9.0)];
+            joined(&[&[((1, 6), false, logit)][..], &others].concat())
+        };
+        assert!(sure(4.5)[1].is_ok(), "{:?}", sure(4.5));
+        assert!(matches!(sure(7.0)[1], Err(Refusal::Rival { .. })), "{:?}", sure(7.0));
+    }
 }
