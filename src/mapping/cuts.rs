@@ -74,14 +74,14 @@ pub fn bridge(
     })
 }
 
-/// A piece of which only one scan outside sees anything, and that little: all pairs between the two are `slight`. The pairs of one scan with a piece
-/// are no independent witnesses, as they look at the same surfaces. Of the piece and the rest, the smaller; `None` if there is none.
+/// Pieces of which only one scan outside sees anything, and that little: all pairs between the two are `slight`. The pairs of one scan with a piece
+/// are no independent witnesses, as they look at the same surfaces. By the scan, ascending, and its first piece.
 #[must_use]
-pub fn glimpse(
+pub fn glimpses(
     component: &Component,
     supports: &BTreeMap<(ScanKey, ScanKey), f64>,
     slight: &BTreeSet<(ScanKey, ScanKey)>,
-) -> Option<BTreeSet<ScanKey>> {
+) -> Vec<(ScanKey, BTreeSet<ScanKey>)> {
     let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
     let index = |scan: &ScanKey| keys.binary_search(scan).ok();
     let links: Vec<(usize, usize, bool)> = supports
@@ -93,7 +93,7 @@ pub fn glimpse(
         let of_scan = move |link: &&(usize, usize, bool)| link.2 && (link.0 == scan || link.1 == scan);
         links.iter().filter(of_scan).map(move |link| if link.0 == scan { link.1 } else { link.0 })
     };
-    (0..keys.len()).find_map(|scan| {
+    let glimpse = |scan: usize| {
         looks(scan).next()?;
         let others = links.iter().filter(|link| !(link.2 && (link.0 == scan || link.1 == scan)));
         let groups = tied(keys.len(), others.map(|&(a, b, _)| (a, b, 0.0)));
@@ -101,8 +101,9 @@ pub fn glimpse(
         let own = group_of(scan).filter(|own| own.len() >= PIECE)?;
         let mut seen = looks(scan).filter(|other| !own.contains(other)).filter_map(group_of);
         let piece = seen.find(|seen| seen.len() >= PIECE)?;
-        Some(smaller_side(component, piece.iter().map(|scan| keys[*scan]).collect()))
-    })
+        Some((keys[scan], piece.iter().map(|scan| keys[*scan]).collect()))
+    };
+    (0..keys.len()).filter_map(glimpse).collect()
 }
 
 /// The same cut by the side with fewer scans.
@@ -311,23 +312,22 @@ mod tests {
                 pairs.iter().map(|(a, b)| (ScanKey(*a), ScanKey(*b))).collect()
             };
             let supports = pairs(&[&pieces[..], more].concat()).into_iter().map(|pair| (pair, 4.0)).collect();
-            glimpse(&component, &supports, &pairs(slight))
+            let found = glimpses(&component, &supports, &pairs(slight));
+            found.into_iter().next().map(|(scan, piece)| (scan.0, smaller_side(&component, piece)))
         };
         let three = Some([4, 5, 6].map(ScanKey).into());
-        assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4), (3, 5)]), three);
+        assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4), (3, 5)]), three.map(|piece| (3, piece)));
         assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4)]), None, "one pair shares much");
         assert_eq!(find(&[(3, 4), (2, 5)], &[(3, 4), (2, 5)]), None, "two scans see something");
         // A lone scan that it sees little of is no piece, and hides none.
-        let lone = glimpse(
+        let lone = glimpses(
             &component,
             &[(1, 2), (2, 3), (2, 4), (5, 6), (2, 5)].map(|(a, b)| ((ScanKey(a), ScanKey(b)), 4.0)).into(),
             &[(2, 4), (2, 5)].map(|(a, b)| (ScanKey(a), ScanKey(b))).into(),
         );
-        assert_eq!(lone, Some([5, 6].map(ScanKey).into()));
-        assert_eq!(
-            find(&[(1, 4), (2, 4), (3, 4)], &[(1, 4), (2, 4), (3, 4)]).map(|side| side.len()),
-            Some(3)
-        );
+        assert_eq!(lone.first(), Some(&(ScanKey(2), [5, 6].map(ScanKey).into())));
+        let all = [(1, 4), (2, 4), (3, 4)];
+        assert_eq!(find(&all, &all).map(|(scan, side)| (scan, side.len())), Some((4, 3)));
     }
 
     #[test]

@@ -7,6 +7,7 @@
 //! and joint dense adjustment; `track_refinement` moves keypoints; `mapper` has one method a step and `policy` their order.
 
 mod bent_join;
+mod borne_out;
 mod candidates;
 mod close_look;
 mod component;

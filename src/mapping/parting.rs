@@ -5,10 +5,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::borne_out::borne_out;
 use super::candidates::DECIDED;
 use super::component::Component;
 use super::consistency::{agreeing, supports};
-use super::cuts::{bridge, glimpse, loose_side};
+use super::cuts::{bridge, glimpses, loose_side, smaller_side};
 use super::join::Refusal;
 use super::mapper::Mapper;
 use super::options::MappingOptions;
@@ -54,7 +55,7 @@ impl Mapper {
         options: &MappingOptions,
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
-        self.part(graph, options, control, |component, supports| loose_side(component, supports, least))?;
+        self.part(graph, options, control, |component, supports| Ok(loose_side(component, supports, least)))?;
         self.forget_setbacks();
         self.doubted.clear();
         self.undone.clear();
@@ -74,7 +75,7 @@ impl Mapper {
         self.set_aside.clear();
     }
 
-    /// Parts components at their bridges that are not firm, and where one scan alone sees little of a piece.
+    /// Parts components at their bridges that are not firm, and where one scan alone sees little of a piece, unless other scans bear out how it lies.
     pub fn part_at_bridges(
         &mut self,
         graph: &ScanGraph,
@@ -82,8 +83,12 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
         self.part(graph, options, control, |component, supports| {
-            glimpse(component, supports, &slight(graph, component, supports, options))
-                .or_else(|| bridge(component, supports, options.firm_support))
+            for (scan, piece) in glimpses(component, supports, &slight(graph, component, supports, options)) {
+                if !borne_out(graph, component, &piece, scan, control)? {
+                    return Ok(Some(smaller_side(component, piece)));
+                }
+            }
+            Ok(bridge(component, supports, options.firm_support))
         })?;
         self.sort_components();
         Ok(())
@@ -95,12 +100,12 @@ impl Mapper {
         graph: &ScanGraph,
         options: &MappingOptions,
         control: Control<'_>,
-        side: impl Fn(&Component, &Supports) -> Option<BTreeSet<ScanKey>>,
+        side: impl Fn(&Component, &Supports) -> Result<Option<BTreeSet<ScanKey>>, Cancelled>,
     ) -> Result<(), Cancelled> {
         let mut pending = std::mem::take(&mut self.components);
         while let Some(mut component) = pending.pop() {
             control.check()?;
-            match side(&component, &supports(graph, &component, options)) {
+            match side(&component, &supports(graph, &component, options))? {
                 Some(side) => {
                     pending.extend(component.split_off(&side, options));
                     pending.push(component);
