@@ -2,7 +2,7 @@
 //! between them proposes one; proposals that agree form a cluster; the cluster whose edges weigh most wins, and the heaviest
 //! different cluster is its rival.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::Vector3;
 
@@ -42,7 +42,7 @@ pub struct Proposal {
     /// What the hypothesis is worth to a rival: the same, or what the pair alone says if that is more. Third scans that are themselves
     /// misplaced can talk a score down, so a rival keeps its own word.
     pub doubt: f64,
-    /// Log-odds that its pair alone gives it.
+    /// Log-odds that its pair alone gives it; of a member of a cluster, the most that the pair gives any pose there.
     pub alone: f64,
     /// Centroid of `in_b` in the frame of b, metres: where distances between poses are measured.
     pub(super) centroid: Vector3<f64>,
@@ -192,7 +192,7 @@ pub fn candidates(
             support,
             doubt,
             rival: rival_of(centre),
-            members: members(&proposals, centre, options.cluster_angle, reach).copied().collect(),
+            members: with_surest(&proposals, centre, options.cluster_angle, reach),
             decided: false,
         })
         .collect()
@@ -271,6 +271,17 @@ pub fn support_of(
         backing.edges += usize::from(p.evidence > LEAST_WORD);
     }
     backing
+}
+
+/// The members of a cluster, each with the surest word that its pair has there by itself.
+fn with_surest(proposals: &[Proposal], centre: usize, angle: f64, reach: f64) -> Vec<Proposal> {
+    let mut surest: BTreeMap<(ScanKey, ScanKey), f64> = BTreeMap::new();
+    for p in proposals.iter().filter(|p| within(&proposals[centre], p, angle, reach)) {
+        let known = surest.entry((p.in_a, p.in_b)).or_insert(p.alone);
+        *known = known.max(p.alone);
+    }
+    let alone = |p: &Proposal| surest.get(&(p.in_a, p.in_b)).copied().unwrap_or(p.alone);
+    members(proposals, centre, angle, reach).map(|p| Proposal { alone: alone(p), ..*p }).collect()
 }
 
 /// One proposal an edge: those that agree with the centre, the strongest of each edge.

@@ -1,4 +1,4 @@
-//! Cuts through the support that holds a component together: the weakest, and the weakest between two scans.
+//! Cuts through the support that holds a component together: the weakest, the weakest between some scans and others, and those where it hangs by little.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -74,14 +74,25 @@ pub fn bridge(
     })
 }
 
-/// Pieces of which only one scan outside sees anything, and that little: all pairs between the two are `slight`. The pairs of one scan with a piece
-/// are no independent witnesses, as they look at the same surfaces. By the scan, ascending, and its first piece.
+/// A piece of a component of which one scan outside alone sees anything, and that little.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Glimpse {
+    /// The scan.
+    pub scan: ScanKey,
+    /// What the scan is of without that, itself included.
+    pub own: BTreeSet<ScanKey>,
+    /// The piece.
+    pub piece: BTreeSet<ScanKey>,
+}
+
+/// The glimpses in a component, by scan: all pairs between the scan and the piece are `slight`. The pairs of one scan with a piece
+/// are no independent witnesses, as they look at the same surfaces.
 #[must_use]
 pub fn glimpses(
     component: &Component,
     supports: &BTreeMap<(ScanKey, ScanKey), f64>,
     slight: &BTreeSet<(ScanKey, ScanKey)>,
-) -> Vec<(ScanKey, BTreeSet<ScanKey>)> {
+) -> Vec<Glimpse> {
     let keys: Vec<ScanKey> = component.poses.keys().copied().collect();
     let index = |scan: &ScanKey| keys.binary_search(scan).ok();
     let links: Vec<(usize, usize, bool)> = supports
@@ -93,17 +104,21 @@ pub fn glimpses(
         let of_scan = move |link: &&(usize, usize, bool)| link.2 && (link.0 == scan || link.1 == scan);
         links.iter().filter(of_scan).map(move |link| if link.0 == scan { link.1 } else { link.0 })
     };
-    let glimpse = |scan: usize| {
-        looks(scan).next()?;
+    let of_scan = |scan: usize| {
         let others = links.iter().filter(|link| !(link.2 && (link.0 == scan || link.1 == scan)));
         let groups = tied(keys.len(), others.map(|&(a, b, _)| (a, b, 0.0)));
-        let group_of = |scan: usize| groups.iter().find(|group| group.contains(&scan));
-        let own = group_of(scan).filter(|own| own.len() >= PIECE)?;
-        let mut seen = looks(scan).filter(|other| !own.contains(other)).filter_map(group_of);
-        let piece = seen.find(|seen| seen.len() >= PIECE)?;
-        Some((keys[scan], piece.iter().map(|scan| keys[*scan]).collect()))
+        let group_of = |scan: usize| groups.iter().position(|group| group.contains(&scan));
+        let scans = |group: usize| groups[group].iter().map(|scan| keys[*scan]).collect::<BTreeSet<_>>();
+        let is_piece = |group: &usize| groups[*group].len() >= PIECE;
+        let own = group_of(scan).filter(is_piece);
+        let seen: BTreeSet<usize> = looks(scan).filter_map(group_of).filter(is_piece).collect();
+        let glimpses = own.map(|own| {
+            let pieces = seen.into_iter().filter(|piece| *piece != own);
+            pieces.map(|piece| Glimpse { scan: keys[scan], own: scans(own), piece: scans(piece) }).collect()
+        });
+        glimpses.unwrap_or_else(Vec::new)
     };
-    (0..keys.len()).filter_map(glimpse).collect()
+    (0..keys.len()).filter(|scan| looks(*scan).next().is_some()).flat_map(of_scan).collect()
 }
 
 /// The same cut by the side with fewer scans.
@@ -183,7 +198,8 @@ fn weakest_cut(mut weight: Vec<Vec<f64>>, mut groups: Vec<Vec<usize>>) -> Option
 }
 
 /// The cut of least support that separates some scans of a component from others: the side of `from`, and the support across (Edmonds, Karp:
-/// "Theoretical improvements in algorithmic efficiency for network flow problems", JACM 1972).
+/// "Theoretical improvements in algorithmic efficiency for network flow problems", JACM 1972). `None` where either is empty or not of the component, or
+/// they share a scan.
 #[must_use]
 pub fn separating_cut(
     component: &Component,
@@ -197,6 +213,9 @@ pub fn separating_cut(
         |scans: &[ScanKey]| scans.iter().map(|scan| index.get(scan).copied()).collect::<Option<Vec<_>>>();
     let (sources, sinks) = (end(from)?, end(to)?);
     let (source, sink) = (*sources.first()?, *sinks.first()?);
+    if sources.iter().any(|source| sinks.contains(source)) {
+        return None;
+    }
     let n = keys.len();
     let mut spare = vec![0.0_f64; n * n];
     for (first, others) in [(source, &sources), (sink, &sinks)] {
@@ -284,6 +303,7 @@ mod tests {
         );
         assert!((cut - 1.5).abs() < 1e-9);
         assert_eq!(separating_cut(&six(), &supports, &[], &[key(1)]), None);
+        assert_eq!(separating_cut(&six(), &supports, &[key(1), key(2)], &[key(2)]), None);
     }
 
     #[test]
@@ -313,7 +333,7 @@ mod tests {
             };
             let supports = pairs(&[&pieces[..], more].concat()).into_iter().map(|pair| (pair, 4.0)).collect();
             let found = glimpses(&component, &supports, &pairs(slight));
-            found.into_iter().next().map(|(scan, piece)| (scan.0, smaller_side(&component, piece)))
+            found.into_iter().next().map(|found| (found.scan.0, smaller_side(&component, found.piece)))
         };
         let three = Some([4, 5, 6].map(ScanKey).into());
         assert_eq!(find(&[(3, 4), (3, 5)], &[(3, 4), (3, 5)]), three.map(|piece| (3, piece)));
@@ -325,7 +345,8 @@ mod tests {
             &[(1, 2), (2, 3), (2, 4), (5, 6), (2, 5)].map(|(a, b)| ((ScanKey(a), ScanKey(b)), 4.0)).into(),
             &[(2, 4), (2, 5)].map(|(a, b)| (ScanKey(a), ScanKey(b))).into(),
         );
-        assert_eq!(lone.first(), Some(&(ScanKey(2), [5, 6].map(ScanKey).into())));
+        let [own, piece] = [vec![1, 2, 3], vec![5, 6]].map(|scans| scans.into_iter().map(ScanKey).collect());
+        assert_eq!(lone.first(), Some(&Glimpse { scan: ScanKey(2), own, piece }));
         let all = [(1, 4), (2, 4), (3, 4)];
         assert_eq!(find(&all, &all).map(|(scan, side)| (scan, side.len())), Some((4, 3)));
     }

@@ -151,7 +151,7 @@ impl Case<'_> {
         Ok(!testimony.condemns())
     }
 
-    /// Where the component comes apart: a cut between two contradicting scans that what speaks against it with one voice outweighs by this share
+    /// Where the component comes apart: a cut between two contradicting scans, or between several, that what speaks against it with one voice outweighs by this share
     /// of its support, unless a hearing refutes that voice; by its smaller side, and the pair that shows it.
     fn tear(
         &self,
@@ -164,10 +164,12 @@ impl Case<'_> {
         let mut refuted: BTreeSet<BTreeSet<ScanKey>> = BTreeSet::new();
         let single = |c: &&Contradiction| separating_cut(component, supports, &[c.pair.a], &[c.pair.b]);
         let singles = inside.iter().take(TRIED).filter_map(|c| Some((single(c)?, *c)));
-        // Where the first fail, all.
-        let gathered = std::iter::once(()).flat_map(|()| self.gathered(&inside));
+        // Where they fail, all; the first of these is known.
+        let gathered = std::iter::once(()).flat_map(|()| self.gathered(&inside)).skip(1);
         for ((side, support), strongest) in singles.chain(gathered) {
-            if refuted.contains(&side) {
+            control.check()?;
+            let smaller = smaller_side(component, side.clone());
+            if refuted.contains(&smaller) {
                 continue;
             }
             let words = Word::on_side(graph, component, &side, &inside, options);
@@ -182,10 +184,10 @@ impl Case<'_> {
             if let Some(hearing) = &hearing
                 && hearing.hear(&voice, &BTreeSet::new(), options, control)? == Ruling::Refuted
             {
-                refuted.insert(side);
+                refuted.insert(smaller);
                 continue;
             }
-            return Ok(Some((smaller_side(component, side), *strongest)));
+            return Ok(Some((smaller, *strongest)));
         }
         Ok(None)
     }
@@ -203,9 +205,6 @@ impl Case<'_> {
                 let mut ends = sides.clone();
                 for (end, scan) in ends.iter_mut().zip(way) {
                     end.push(scan);
-                }
-                if ends[0].iter().any(|scan| ends[1].contains(scan)) {
-                    return None;
                 }
                 let cut = separating_cut(self.component, self.supports, &ends[0], &ends[1])?;
                 Some((cut, ends))

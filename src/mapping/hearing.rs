@@ -221,10 +221,10 @@ impl<'g> Seen<'g> {
         let least = if self.counts.is_some() { -MOST } else { 0.0 };
         let before = self.counts.as_ref().or(usual)?;
         let lost = |moved: &Pose| {
-            // What the pair itself found there is nearer to right than what another pair's pose implies.
+            // What the pair itself found there is nearer to right than what another pair's pose implies; of several, what it is surest of.
             let found = self.edge.hypotheses.iter().map(|h| &h.hypothesis);
             let own = found
-                .filter(|h| near(&h.a_from_b, moved))
+                .filter(|h| near(&h.a_from_b, moved) && !near(&now, &h.a_from_b))
                 .max_by(|x, y| x.logit.total_cmp(&y.logit))
                 .map(|h| h.a_from_b);
             if own.is_none() && !self.meet(moved) {

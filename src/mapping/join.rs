@@ -18,7 +18,7 @@ use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::{Kernel, Pose, rigid_fit};
 use crate::graph::ScanGraph;
-use crate::pairwise::{Counts, inlier_matches, is_clearly_worse, look_finely};
+use crate::pairwise::{Counts, centred_difference, inlier_matches, is_clearly_worse, look_finely};
 
 const FIT_ITERATIONS: usize = 5;
 /// Firm support allows this many times the usual violation, at most.
@@ -27,6 +27,10 @@ const FIRM_LENIENCE: f64 = 1.5;
 const MAX_WRONG_NORMAL: f64 = 0.38;
 /// Pairs of each of two poses that a second look is taken at, the firmest.
 const SECOND_LOOKS: usize = 6;
+/// A pair is a witness by itself with these log-odds, a likelihood of 0.88, …
+const WITNESS: f64 = 2.0;
+/// … and clearly surer than another with as many more as this.
+const LEAD: f64 = 1.0;
 /// Edges whose own poses are tried where the fit to all of them fails.
 pub const SINGLE_STARTS: usize = 6;
 
@@ -40,7 +44,7 @@ pub enum Refusal {
         /// What the level asks.
         needed: f64,
     },
-    /// A different pose is about as well supported.
+    /// A different pose is about as well supported, or a pair is surer of it than any of this one.
     Rival {
         /// Support of the candidate.
         support: f64,
@@ -139,8 +143,9 @@ impl<'m> ViolationLimit<'m> {
 }
 
 /// Weighs the candidates of two components against each other, best supported first (`candidates`, in that order): the first that keeps
-/// its support and stays clear of free space is taken, unless another is nearly as heavy that neither free space rules out nor a second look
-/// finds clearly worse. Returns `a_from_b`.
+/// its support and stays clear of free space is taken, unless another is nearly as heavy, or of a lone scan clearly surer by one pair, that neither
+/// free space rules out nor a second look finds clearly worse. At the strictest level only pairs count that have a voice of their own. Returns
+/// `a_from_b`.
 pub fn weigh_join(
     graph: &ScanGraph,
     (a, b): (&Component, &Component),
@@ -155,6 +160,12 @@ pub fn weigh_join(
     // What is joined already, and only weighed again, need not show as much.
     let weighed_again = level.support <= 0.0;
     let strictest = !weighed_again && options.is_strictest(level);
+    let lone = a.len().min(b.len()) == 1;
+    let centre = centre_of(graph, b);
+    let same = |x: &Pose, y: &Pose| {
+        let (angle, distance) = centred_difference(x, y, &centre);
+        angle < options.rival_angle && distance < options.rival_voxels * voxel
+    };
     let limit = ViolationLimit::new(graph, (a, b), level, options);
     let gravity = Gravity::between(graph, a, b);
     let place = |candidate: &Candidate, least: f64, edges: usize| {
@@ -185,14 +196,18 @@ pub fn weigh_join(
                 }
                 let margin = |rival: f64| placed.support - options.rival_share * rival;
                 // Rivals are looked at only as far as they matter. The pairs that one scan has with a piece are no independent witnesses: together they
-                // do not outweigh one that is surer than any of them.
-                let surest = candidate.surest();
-                let feared = candidates.iter().enumerate().filter(|(other, c)| {
-                    *other != rank && (margin(c.doubt) < level.support || c.surest() > surest)
-                });
+                // do not outweigh one that is clearly surer than any of them.
+                let surest = if lone && !weighed_again { candidate.surest() } else { f64::INFINITY };
+                let surer = |rival: &Candidate| rival.surest() > WITNESS.max(surest + LEAD);
+                let feared = candidates
+                    .iter()
+                    .enumerate()
+                    .filter(|(other, c)| *other != rank && (margin(c.doubt) < level.support || surer(c)));
                 for (_, rival) in feared {
                     control.check()?;
+                    // A rival that alignment brings to the same place is none.
                     if let Ok(there) = place(rival, 0.0, 0)
+                        && !same(&placed.a_from_b, &there.a_from_b)
                         && !outdone(graph, (a, b), (candidate, &placed), (rival, &there), voxel, control)?
                     {
                         return Ok(Err(Refusal::Rival { support: placed.support, rival: rival.doubt }));
@@ -204,6 +219,15 @@ pub fn weigh_join(
         }
     }
     Ok(Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support })))
+}
+
+/// The middle of a component's scans, metres in its frame.
+fn centre_of(graph: &ScanGraph, component: &Component) -> Vector3<f64> {
+    let places =
+        component.poses.iter().filter_map(|(scan, pose)| Some(pose.transform(&graph.scan(*scan)?.centroid)));
+    let (sum, count) =
+        places.fold((Vector3::zeros(), 0_usize), |(sum, count), place| (sum + place, count + 1));
+    sum / count.max(1) as f64
 }
 
 /// Whether a second look at the pairs that speak for either of two poses finds the rival's clearly worse.

@@ -10,7 +10,7 @@ use crate::graph::SupportOptions;
 /// What a join must show. Tried from the strictest down; after every join the strictest comes first again.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct JoinLevel {
-    /// Least support, after half of the runner-up's is taken off.
+    /// Least support, after half of the runner-up's is taken off; at the strictest level, of pairs that do not speak against the pose by themselves.
     pub support: f64,
     /// Largest share of violations of free space among the points that can be judged.
     pub violation: f64,

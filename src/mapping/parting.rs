@@ -1,5 +1,5 @@
 //! Components that are parted: what hangs together by little, to be decided anew, and pieces that one weak pair alone holds together, or one scan that
-//! sees little of the other piece. Such pieces
+//! sees little of the other piece, unless other scans bear out how they lie. Such pieces
 //! are not joined on one pair; but scan by scan, each on a pair of its own, a component can grow across one all the same, and if that pair is
 //! wrong, so is all behind it. Used by `live_model` and `policy`.
 
@@ -83,13 +83,14 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
         self.part(graph, options, control, |component, supports| {
-            for (scan, piece) in glimpses(component, supports, &slight(graph, component, supports, options)) {
-                if !borne_out(graph, component, &piece, scan, control)? {
-                    return Ok(Some(smaller_side(component, piece)));
+            for glimpse in glimpses(component, supports, &slight(graph, component, supports, options)) {
+                if !borne_out(graph, component, &glimpse, control)? {
+                    return Ok(Some(smaller_side(component, glimpse.piece)));
                 }
             }
             Ok(bridge(component, supports, options.firm_support))
         })?;
+        graph.forget_fine();
         self.sort_components();
         Ok(())
     }

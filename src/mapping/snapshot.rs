@@ -26,7 +26,7 @@ pub enum WaitingReason {
         /// Support that a join needs.
         needed: f64,
     },
-    /// Candidate poses exist, but two different ones are about equally good.
+    /// Candidate poses exist, but two different ones are about equally good, or a pair is surer of the second than any of the first.
     Ambiguous {
         /// Support of the best candidate pose.
         best_support: f64,

@@ -66,9 +66,14 @@ pub fn associate(
 }
 
 /// Whether two scans at given poses in one frame can share anything at all, by their centroids and radii.
-fn may_overlap(x: &Scan, x_pose: &Pose, y: &Scan, y_pose: &Pose) -> bool {
+pub(super) fn may_overlap(x: &Scan, x_pose: &Pose, y: &Scan, y_pose: &Pose) -> bool {
     let distance = (x_pose.transform(&x.centroid) - y_pose.transform(&y.centroid)).norm();
     distance < NEAR_RADII * (x.rms_radius + y.rms_radius)
+}
+
+/// Share of a coarse sample of either scan on the surface of the other, the larger.
+pub(super) fn coarse_overlap_of_either(i: &Scan, j: &Scan, i_from_j: &Pose) -> f64 {
+    coarse_overlap(i, j, i_from_j).max(coarse_overlap(j, i, &i_from_j.inverse()))
 }
 
 /// Share of a coarse sample of `j` on the surface of `i`.
@@ -99,7 +104,7 @@ fn crossings<'g>(graph: &'g ScanGraph, a: &Component, b: &Component, a_from_b: &
                 return None;
             }
             let i_from_j = a_from_i.inverse() * a_from_j;
-            let overlap = coarse_overlap(i, j, &i_from_j).max(coarse_overlap(j, i, &i_from_j.inverse()));
+            let overlap = coarse_overlap_of_either(i, j, &i_from_j);
             Some(Crossing { i, j, a_from_i: **a_from_i, b_from_j: **b_from_j, overlap })
         })
         .collect();
