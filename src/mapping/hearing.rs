@@ -213,20 +213,21 @@ impl<'g> Seen<'g> {
     fn loss(&self, usual: Option<&Counts>, motion: &Pose, options: &MappingOptions) -> Option<Loss> {
         let (a, b) = (self.a, self.b);
         let voxel = a.prepared.resolution;
-        let near = |x: &Pose, y: &Pose| {
+        let apart = |x: &Pose, y: &Pose| {
             let (angle, distance) = centred_difference(x, y, &b.centroid);
-            angle < options.rival_angle && distance < options.rival_voxels * voxel
+            (angle < options.rival_angle && distance < options.rival_voxels * voxel).then_some(distance)
         };
+        let near = |x: &Pose, y: &Pose| apart(x, y).is_some();
         let now = self.model_from_a.inverse() * self.model_from_b;
         let least = if self.counts.is_some() { -MOST } else { 0.0 };
         let before = self.counts.as_ref().or(usual)?;
         let lost = |moved: &Pose| {
-            // What the pair itself found there is nearer to right than what another pair's pose implies; of several, what it is surest of.
-            let found = self.edge.hypotheses.iter().map(|h| &h.hypothesis);
+            // What the pair itself found there is nearer to right than what another pair's pose implies.
+            let found = self.edge.hypotheses.iter().map(|h| h.hypothesis.a_from_b);
             let own = found
-                .filter(|h| near(&h.a_from_b, moved) && !near(&now, &h.a_from_b))
-                .max_by(|x, y| x.logit.total_cmp(&y.logit))
-                .map(|h| h.a_from_b);
+                .filter_map(|pose| Some((apart(&pose, moved)?, pose)))
+                .min_by(|x, y| x.0.total_cmp(&y.0))
+                .map(|(_, pose)| pose);
             if own.is_none() && !self.meet(moved) {
                 return Some(0.0);
             }

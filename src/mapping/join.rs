@@ -196,9 +196,11 @@ pub fn weigh_join(
                 }
                 let margin = |rival: f64| placed.support - options.rival_share * rival;
                 // Rivals are looked at only as far as they matter. The pairs that one scan has with a piece are no independent witnesses: together they
-                // do not outweigh one that is clearly surer than any of them.
+                // do not outweigh one that is clearly surer than any of them. Rivals that are heavier anyhow are judged by the margin.
                 let surest = if lone && !weighed_again { candidate.surest() } else { f64::INFINITY };
-                let surer = |rival: &Candidate| rival.surest() > WITNESS.max(surest + LEAD);
+                let surer = |rival: &Candidate| {
+                    rival.doubt < placed.support && rival.surest() > WITNESS.max(surest + LEAD)
+                };
                 let feared = candidates
                     .iter()
                     .enumerate()
