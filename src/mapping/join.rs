@@ -207,9 +207,10 @@ pub fn weigh_join(
                     .filter(|(other, c)| *other != rank && (margin(c.doubt) < level.support || surer(c)));
                 for (_, rival) in feared {
                     control.check()?;
-                    // A rival that alignment brings to the same place is none.
+                    // A lighter rival that alignment brings to the same place is none.
+                    let lighter = margin(rival.doubt) >= level.support;
                     if let Ok(there) = place(rival, 0.0, 0)
-                        && !same(&placed.a_from_b, &there.a_from_b)
+                        && !(lighter && same(&placed.a_from_b, &there.a_from_b))
                         && !outdone(graph, (a, b), (candidate, &placed), (rival, &there), voxel, control)?
                     {
                         return Ok(Err(Refusal::Rival { support: placed.support, rival: rival.doubt }));
