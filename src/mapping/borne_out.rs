@@ -24,7 +24,7 @@ const PAIRS: usize = 3;
 /// … of this many scans at least on either side, …
 const SCANS: usize = 2;
 /// … and put no more than this share of what can be judged into free space, all together: of a lab of depth cameras that lies right, 0.06 to 0.08 % is
-/// there. Of the pieces of simulated houses, whose views are few, none has pairs enough to tell.
+/// there. Of ten such pieces of simulated houses, whose views are few, none has pairs enough to tell.
 const MOST_VIOLATION: f64 = 0.005;
 
 /// Whether pairs of a piece and of what the scan that sees it is of bear out how these lie, those of that scan aside. Where there are no fine

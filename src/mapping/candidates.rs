@@ -13,6 +13,7 @@ use super::options::MappingOptions;
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 use crate::graph::{ScanGraph, evidence};
+use crate::pairwise::centred_difference;
 
 /// Hypotheses with less evidence than this propose nothing.
 const LEAST_EVIDENCE: f64 = 0.03;
@@ -302,6 +303,24 @@ fn best_by_edge<'p>(proposals: impl Iterator<Item = &'p Proposal>) -> impl Itera
 pub fn near(a_from_b: &Pose, proposal: &Proposal, voxel: f64, options: &MappingOptions) -> bool {
     let reach = options.cluster_voxels * voxel;
     agree(a_from_b, &proposal.a_from_b, &proposal.centroid, options.cluster_angle, reach)
+}
+
+/// Whether two poses of a component put one of its scans at different places, as rivals are. `voxel` in metres.
+#[must_use]
+pub fn moved(
+    graph: &ScanGraph,
+    part: &Component,
+    x: &Pose,
+    y: &Pose,
+    voxel: f64,
+    options: &MappingOptions,
+) -> bool {
+    part.poses.iter().any(|(scan, pose)| {
+        graph.scan(*scan).is_some_and(|scan| {
+            let (angle, distance) = centred_difference(&(*x * *pose), &(*y * *pose), &scan.centroid);
+            angle > options.rival_angle || distance > options.rival_voxels * voxel
+        })
+    })
 }
 
 fn within(x: &Proposal, y: &Proposal, angle: f64, reach: f64) -> bool {

@@ -5,11 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::component::Component;
 use super::cuts::separating_cut;
-use super::join::{ViolationLimit, violation_of};
 use super::options::MappingOptions;
 use super::surfaces::{judge, judge_each};
 use super::testimony::Contradiction;
 use super::tracks::Tracks;
+use super::violation::{ViolationLimit, violation_of};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::Pose;

@@ -1,34 +1,30 @@
 //! One join: a scan into a component, or a component into another. From the candidate pose through a fit to pooled matches and
 //! a dense alignment to the verdict on everything that overlaps.
 
-use std::cell::OnceCell;
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
 use nalgebra::Vector3;
 
-use super::candidates::{Backing, Candidate, near, support_of};
+use super::candidates::{Backing, Candidate, moved, near, support_of};
 use super::close_look::objection;
 use super::component::Component;
 use super::gravity::Gravity;
 use super::options::{JoinLevel, MappingOptions};
-use super::surfaces::{align, judge, judge_inside};
+use super::surfaces::{align, judge};
+use super::violation::{ViolationLimit, violation_of};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
 use crate::geometry::{Kernel, Pose, rigid_fit};
 use crate::graph::ScanGraph;
-use crate::pairwise::{Counts, centred_difference, inlier_matches, is_clearly_worse, look_finely};
+use crate::pairwise::{Counts, inlier_matches, is_clearly_worse, look_finely};
 
 const FIT_ITERATIONS: usize = 5;
-/// Firm support allows this many times the usual violation, at most.
-const FIRM_LENIENCE: f64 = 1.5;
-/// Of the points that are near the other side, at most this share may face another way. Right joins of components show up to 0.3.
-const MAX_WRONG_NORMAL: f64 = 0.38;
 /// Pairs of each of two poses that a second look is taken at, the firmest.
 const SECOND_LOOKS: usize = 6;
-/// A pair is a witness by itself with these log-odds, a likelihood of 0.88, …
-const WITNESS: f64 = 2.0;
+/// A pair is sure by itself with these log-odds, a likelihood of 0.88, …
+const SURE: f64 = 2.0;
 /// … and clearly surer than another with as many more as this.
 const LEAD: f64 = 1.0;
 /// Edges whose own poses are tried where the fit to all of them fails.
@@ -94,54 +90,6 @@ struct Needed<'l, 'm> {
     gravity: Option<Gravity>,
 }
 
-/// The violation that a join may show: little more than the two sides show within themselves, so that clean data, where wrong joins of
-/// alike rooms stand out, is judged more strictly than noisy data; more where support is firm, since a fit that is a little off
-/// violates a little; and never more than the level says. What was bent, or has grown since, is allowed some times as much by those who
-/// ask. What the sides show is only counted when that matters.
-pub struct ViolationLimit<'m> {
-    most: f64,
-    floor: f64,
-    firm_support: f64,
-    usual: OnceCell<f64>,
-    count: Box<dyn Fn() -> f64 + 'm>,
-}
-
-impl<'m> ViolationLimit<'m> {
-    /// The limit for joining `a` and `b` at this level.
-    #[must_use]
-    pub fn new(
-        graph: &'m ScanGraph,
-        (a, b): (&'m Component, &'m Component),
-        level: &JoinLevel,
-        options: &'m MappingOptions,
-    ) -> Self {
-        let count = move || {
-            let inside = judge_inside(graph, a).plus(&judge_inside(graph, b)).violation_share();
-            options.violation_contrast * inside + options.violation_floor
-        };
-        Self {
-            most: level.violation,
-            floor: options.violation_floor,
-            firm_support: options.firm_support,
-            usual: OnceCell::new(),
-            count: Box::new(count),
-        }
-    }
-
-    /// Whether a join that has this support may violate free space by this share.
-    #[must_use]
-    pub fn admits(&self, violation: f64, support: f64) -> bool {
-        violation <= self.most.min(self.floor) || violation <= self.share(support)
-    }
-
-    /// The largest share that is allowed for this support.
-    #[must_use]
-    pub fn share(&self, support: f64) -> f64 {
-        let usual = *self.usual.get_or_init(&self.count);
-        self.most.min(usual * (support / self.firm_support).clamp(1.0, FIRM_LENIENCE))
-    }
-}
-
 /// Weighs the candidates of two components against each other, best supported first (`candidates`, in that order): the first that keeps
 /// its support and stays clear of free space is taken, unless another is nearly as heavy, or of a lone scan clearly surer by one pair, that neither
 /// free space rules out nor a second look finds clearly worse. At the strictest level only pairs count that have a voice of their own. Returns
@@ -161,11 +109,6 @@ pub fn weigh_join(
     let weighed_again = level.support <= 0.0;
     let strictest = !weighed_again && options.is_strictest(level);
     let lone = a.len().min(b.len()) == 1;
-    let centre = centre_of(graph, b);
-    let same = |x: &Pose, y: &Pose| {
-        let (angle, distance) = centred_difference(x, y, &centre);
-        angle < options.rival_angle && distance < options.rival_voxels * voxel
-    };
     let limit = ViolationLimit::new(graph, (a, b), level, options);
     let gravity = Gravity::between(graph, a, b);
     let place = |candidate: &Candidate, least: f64, edges: usize| {
@@ -199,7 +142,7 @@ pub fn weigh_join(
                 // do not outweigh one that is clearly surer than any of them. Rivals that are heavier anyhow are judged by the margin.
                 let surest = if lone && !weighed_again { candidate.surest() } else { f64::INFINITY };
                 let surer = |rival: &Candidate| {
-                    rival.doubt < placed.support && rival.surest() > WITNESS.max(surest + LEAD)
+                    rival.doubt < placed.support && rival.surest() > SURE.max(surest + LEAD)
                 };
                 let feared = candidates
                     .iter()
@@ -210,7 +153,7 @@ pub fn weigh_join(
                     // A lighter rival that alignment brings to the same place is none.
                     let lighter = margin(rival.doubt) >= level.support;
                     if let Ok(there) = place(rival, 0.0, 0)
-                        && !(lighter && same(&placed.a_from_b, &there.a_from_b))
+                        && (!lighter || moved(graph, b, &placed.a_from_b, &there.a_from_b, voxel, options))
                         && !outdone(graph, (a, b), (candidate, &placed), (rival, &there), voxel, control)?
                     {
                         return Ok(Err(Refusal::Rival { support: placed.support, rival: rival.doubt }));
@@ -222,15 +165,6 @@ pub fn weigh_join(
         }
     }
     Ok(Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support })))
-}
-
-/// The middle of a component's scans, metres in its frame.
-fn centre_of(graph: &ScanGraph, component: &Component) -> Vector3<f64> {
-    let places =
-        component.poses.iter().filter_map(|(scan, pose)| Some(pose.transform(&graph.scan(*scan)?.centroid)));
-    let (sum, count) =
-        places.fold((Vector3::zeros(), 0_usize), |(sum, count), place| (sum + place, count + 1));
-    sum / count.max(1) as f64
 }
 
 /// Whether a second look at the pairs that speak for either of two poses finds the rival's clearly worse.
@@ -263,13 +197,6 @@ fn outdone(
         }
     }
     Ok(is_clearly_worse(&mine, &others, voxel / 2.0))
-}
-
-/// The share of judged points that speak against a pose: in free space, or all of them where surfaces cross instead of coinciding,
-/// which is no overlap, however clear of free space it is.
-#[must_use]
-pub fn violation_of(counts: &Counts) -> f64 {
-    if counts.wrong_normal_share() > MAX_WRONG_NORMAL { 1.0 } else { counts.violation_share() }
 }
 
 /// Aligns one candidate and checks that it keeps what is needed, no ban stands against it, and free space allows it. Where edges

@@ -43,6 +43,7 @@ mod track_refinement;
 mod tracks;
 mod undecided;
 mod undo;
+mod violation;
 mod voice;
 mod waiting_reason;
 mod widening;

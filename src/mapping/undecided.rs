@@ -5,7 +5,7 @@
 
 use std::collections::BTreeSet;
 
-use super::candidates::{CLUSTERS, candidates};
+use super::candidates::{CLUSTERS, candidates, moved};
 use super::component::Component;
 use super::cuts::smaller_side;
 use super::hearing::{Hearing, Ruling};
@@ -15,7 +15,6 @@ use super::testimony::{CLEARLY_DIFFERENT, Contradiction, Testimony};
 use super::voice::{Word, loudest};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
-use crate::geometry::Pose;
 use crate::graph::{ScanGraph, evidence};
 use crate::pairwise::centred_difference;
 
@@ -126,23 +125,6 @@ fn reweigh(
         Ok(Err(_)) => None,
         Err(cancelled) => Some(Err(cancelled)),
     }
-}
-
-/// Whether two poses of a component put one of its scans at clearly different places.
-fn moved(
-    graph: &ScanGraph,
-    part: &Component,
-    x: &Pose,
-    y: &Pose,
-    voxel: f64,
-    options: &MappingOptions,
-) -> bool {
-    part.poses.iter().any(|(scan, pose)| {
-        graph.scan(*scan).is_some_and(|scan| {
-            let (angle, distance) = centred_difference(&(*x * *pose), &(*y * *pose), &scan.centroid);
-            angle > options.rival_angle || distance > options.rival_voxels * voxel
-        })
-    })
 }
 
 /// For every pair of a component's scans, the share of their support for where they are that a rival may have, less what they say for
