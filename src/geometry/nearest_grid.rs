@@ -17,6 +17,8 @@ const EMPTY: u32 = u32::MAX;
 const REACH: i64 = 3;
 /// Cells along an axis that know a point.
 const WIDTH: usize = 2 * REACH as usize + 1;
+/// Bricks that meet at a corner.
+const CORNERS: usize = 8;
 /// Top-level bricks at most, so that a stray point far away cannot make the table huge (16 MiB of it), and that the number of a
 /// brick and that of a cell in it fit into one word.
 const MAX_BRICKS: usize = 1 << 22;
@@ -51,19 +53,20 @@ impl NearestGrid {
             };
         };
         let bricks: [i64; 3] = std::array::from_fn(|k| (high[k] - low[k]) / BRICK + 1);
-        let mut grid = Self {
-            size,
-            low,
-            bricks,
-            table: vec![0; bricks.iter().product::<i64>() as usize + 1],
-            cells: vec![EMPTY; BRICK_CELLS],
+        let table = vec![0; bricks.iter().product::<i64>() as usize + 1];
+        let mut grid = Self { size, low, bricks, table, cells: Vec::new() };
+        let is_inside = |k: usize, cell: i64| {
+            cell.checked_sub(REACH).is_some_and(|lower| lower >= low[k])
+                && cell.checked_add(REACH).is_some_and(|upper| upper <= high[k])
         };
-        let mut distances: Vec<f32> = vec![f32::INFINITY; BRICK_CELLS];
-        for (index, (cell, point)) in cells.iter().zip(points).enumerate() {
-            if (0..3).all(|k| cell[k] - REACH >= low[k] && cell[k] + REACH <= high[k]) {
-                grid.spread(index as u32, *cell, point, &mut distances);
-            }
+        let inside: Vec<(u32, [i64; 3])> =
+            (0..).zip(cells).filter(|(_, cell)| (0..3).all(|k| is_inside(k, cell[k]))).collect();
+        let made = grid.make_bricks(inside.iter().map(|(_, cell)| cell));
+        let mut offers = vec![NONE_OFFERED; made * BRICK_CELLS];
+        for (index, cell) in inside {
+            offer(index, &grid.near(cell, &points[index as usize]), &mut offers);
         }
+        grid.cells = offers.iter().map(|offer| unpacked(*offer)).collect();
         grid
     }
 
@@ -101,64 +104,118 @@ impl NearestGrid {
         }
     }
 
-    /// Offers a point to all cells in reach of its own: rows of them along z, as they lie in the bricks, without a branch for each.
-    fn spread(&mut self, index: u32, cell: [i64; 3], point: &Point, distances: &mut Vec<f32>) {
-        let [_, ny, nz] = self.bricks;
-        let along_x = self.steps(0, ny * nz, 2 * BRICK_BITS, cell, point);
-        let along_y = self.steps(1, nz, BRICK_BITS, cell, point);
-        let along_z = self.steps(2, 1, 0, cell, point);
-        // The reach is less than a brick, so it is in one brick along z or in two.
-        let bricks = [along_z[0].brick, along_z[WIDTH - 1].brick];
-        let mut rows = [[f32::INFINITY; BRICK as usize]; 2];
-        for step in &along_z {
-            rows[usize::from(step.brick != bricks[0])][step.inner] = step.square;
+    /// Gives numbers to the bricks that cells with points reach, and to no others. How many there are with the empty one.
+    fn make_bricks<'c>(&mut self, occupied: impl Iterator<Item = &'c [i64; 3]>) -> usize {
+        let mut last = None;
+        for cell in occupied {
+            let reached = self.reached(*cell);
+            // Cells in a row mostly reach the same.
+            if last != Some(reached) {
+                for brick in reached {
+                    self.table[brick] = 1;
+                }
+                last = Some(reached);
+            }
         }
-        let rows = &rows[..if bricks[0] == bricks[1] { 1 } else { 2 }];
-        for x in &along_x {
-            for y in &along_y {
-                let square = x.square + y.square;
-                for (row, brick) in rows.iter().zip(bricks) {
-                    let first = self.first_cell(x.brick + y.brick + brick, distances) + (x.inner | y.inner);
-                    let cells = &mut self.cells[first..first + row.len()];
-                    let distances = &mut distances[first..first + row.len()];
-                    for ((along, cell), distance) in row.iter().zip(cells).zip(distances) {
-                        let nearer = square + along < *distance;
-                        *cell = if nearer { index } else { *cell };
-                        *distance = if nearer { square + along } else { *distance };
+        let mut made = 0;
+        for place in self.table.iter_mut().filter(|place| **place > 0) {
+            made += 1;
+            *place = made;
+        }
+        made as usize + 1
+    }
+
+    /// The bricks that a cell reaches: by its lower or its upper end along x, y and z. The reach is less than a brick, so there are no
+    /// others; the same may be there several times.
+    fn reached(&self, cell: [i64; 3]) -> [usize; CORNERS] {
+        let [_, ny, nz] = self.bricks;
+        let end =
+            |k: usize, upper: bool| (cell[k] + if upper { REACH } else { -REACH } - self.low[k]) / BRICK;
+        std::array::from_fn(|corner| {
+            let [x, y, z] = [4, 2, 1].map(|bit| corner & bit != 0);
+            ((end(0, x) * ny + end(1, y)) * nz + end(2, z)) as usize
+        })
+    }
+
+    /// What is in reach of a point in `cell`.
+    fn near(&self, cell: [i64; 3], point: &Point) -> Near {
+        let bricks = self.reached(cell).map(|brick| self.table[brick] as usize * BRICK_CELLS);
+        let along: [[Step; WIDTH]; 3] = std::array::from_fn(|k| {
+            let first = cell[k] - REACH - self.low[k];
+            std::array::from_fn(|i| {
+                let offset = first + i as i64;
+                let d = ((offset + self.low[k]) as f32 + 0.5) * self.size - point[k];
+                let is_upper = offset / BRICK != first / BRICK;
+                Step { inner: (offset % BRICK) as usize, is_upper, square: d * d }
+            })
+        });
+        let mut rows = [[f32::INFINITY; BRICK as usize]; 2];
+        for step in &along[2] {
+            rows[usize::from(step.is_upper)][step.inner] = step.square;
+        }
+        let [x, y, z] = along;
+        Near { bricks, x, y, rows, split: z[WIDTH - 1].is_upper }
+    }
+}
+
+/// The cells in reach of a point, and its squared distances from their centres, each the sum of what three axes contribute, square metres.
+struct Near {
+    /// Where the cells of the bricks start: the lower and the upper one along z, of each of two along y, of each of two along x.
+    bricks: [usize; CORNERS],
+    x: [Step; WIDTH],
+    y: [Step; WIDTH],
+    /// What z contributes, for all cells of a brick that differ in z alone, in the lower and in the upper brick; infinite out of reach.
+    rows: [[f32; BRICK as usize]; 2],
+    /// Whether the reach along z is in two bricks.
+    split: bool,
+}
+
+/// What one axis contributes to the place of a cell, and to its squared distance from a point.
+struct Step {
+    /// Cells from the start of the brick.
+    inner: usize,
+    /// Whether that is the upper of two bricks.
+    is_upper: bool,
+    /// Square metres.
+    square: f32,
+}
+
+/// Offers a point to all cells in reach: rows of them along z, as they lie in the bricks, without a branch for each.
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn offer(index: u32, near: &Near, offers: &mut [Offer]) {
+    let along_z = if near.split { 2 } else { 1 };
+    for x in &near.x {
+        for y in &near.y {
+            let square = x.square + y.square;
+            let corner = 4 * usize::from(x.is_upper) + 2 * usize::from(y.is_upper);
+            let inner = (x.inner << (2 * BRICK_BITS)) | (y.inner << BRICK_BITS);
+            for (row, brick) in near.rows[..along_z].iter().zip(&near.bricks[corner..]) {
+                if let Some(best) = offers[brick + inner..].first_chunk_mut::<{ BRICK as usize }>() {
+                    for (best, along) in best.iter_mut().zip(row) {
+                        *best = (*best).min(packed(square + along, index));
                     }
                 }
             }
         }
     }
-
-    /// The cells in reach of `cell` along axis `k`, where a step of a brick is `stride` bricks and cells lie `1 << shift` apart.
-    fn steps(&self, k: usize, stride: i64, shift: u32, cell: [i64; 3], point: &Point) -> [Step; WIDTH] {
-        std::array::from_fn(|i| {
-            let cell = cell[k] - REACH + i as i64;
-            let offset = cell - self.low[k];
-            let d = (cell as f32 + 0.5) * self.size - point[k];
-            let (brick, inner) = (offset / BRICK * stride, (offset % BRICK) << shift);
-            Step { brick: brick as usize, inner: inner as usize, square: d * d }
-        })
-    }
-
-    /// Where the cells of a brick start, which is made if need be.
-    #[inline]
-    fn first_cell(&mut self, brick: usize, distances: &mut Vec<f32>) -> usize {
-        if self.table[brick] == 0 {
-            self.table[brick] = (self.cells.len() / BRICK_CELLS) as u32;
-            self.cells.resize(self.cells.len() + BRICK_CELLS, EMPTY);
-            distances.resize(self.cells.len(), f32::INFINITY);
-        }
-        self.table[brick] as usize * BRICK_CELLS
-    }
 }
 
-/// What one axis contributes to the place of a cell, and to its squared distance from a point.
-struct Step {
-    brick: usize,
-    inner: usize,
-    square: f32,
+/// A point offered to a cell, its squared distance (square metres) in the upper half and its number in the lower, so that the least is the
+/// nearest, and of points as near as each other the first. A signed number, as not every processor compares unsigned ones side by side.
+type Offer = i64;
+
+/// What is not nearer than any.
+const NONE_OFFERED: Offer = (f32::INFINITY.to_bits() as i64) << 32;
+
+#[inline]
+fn packed(square: f32, index: u32) -> Offer {
+    // Bits of numbers that are not negative are in the order of the numbers.
+    (i64::from(square.to_bits()) << 32) | i64::from(index)
+}
+
+/// The point that was offered, or EMPTY.
+fn unpacked(offer: Offer) -> u32 {
+    if offer < NONE_OFFERED { offer as u32 } else { EMPTY }
 }
 
 /// What it takes to find the cell of a point.
@@ -209,12 +266,12 @@ fn bounds(cells: &[[i64; 3]]) -> Option<([i64; 3], [i64; 3])> {
         let mut high = [0; 3];
         for k in 0..3 {
             let mut axis: Vec<i64> = cells.iter().map(|c| c[k]).collect();
-            axis.sort_unstable();
-            low[k] = axis.get(trim)?.saturating_sub(REACH);
-            high[k] = axis.get(axis.len().checked_sub(1 + trim)?)?.saturating_add(REACH);
-            if high[k] < low[k] {
+            let upper = axis.len().checked_sub(1 + trim)?;
+            if upper < trim {
                 return None;
             }
+            low[k] = axis.select_nth_unstable(trim).1.saturating_sub(REACH);
+            high[k] = axis.select_nth_unstable(upper).1.saturating_add(REACH);
         }
         let fits = (0..3)
             .try_fold(1_usize, |product, k| {
