@@ -1,6 +1,6 @@
 //! Surface normals by principal components of neighbourhoods.
 
-use crate::geometry::{Moments, NeighborIndex, Point, Spread};
+use crate::geometry::{Moments, NeighborIndex, Point, Spread, Surroundings};
 
 /// Fewest neighbours that give a plane.
 const MIN_NEIGHBORS: usize = 6;
@@ -11,9 +11,11 @@ const WIDENING: [f32; 2] = [1.5, 2.25];
 /// where too few points are near or they lie on a line. The sign is arbitrary: see [`face`].
 #[must_use]
 pub fn normals(at: &[Point], index: &NeighborIndex, radius: f32) -> Vec<Option<Point>> {
-    index.map(at, radius, |query, around| {
-        let wider = |widening: &f32| normal(&index.moments(&at[query], radius * widening));
-        normal(&around.moments(&at[query])).or_else(|| WIDENING.iter().find_map(wider))
+    index.map(at, radius, |query, around, spare: &mut Surroundings| {
+        let place = &at[query];
+        let mut wider =
+            |widening: &f32| normal(&spare.gather(index, [place], radius * widening).moments(place));
+        normal(&around.moments(place)).or_else(|| WIDENING.iter().find_map(&mut wider))
     })
 }
 

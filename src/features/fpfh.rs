@@ -19,14 +19,14 @@ pub type Descriptor = [f32; DESCRIPTOR_LEN];
 #[must_use]
 pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor> {
     let index = NeighborIndex::new(points, radius);
-    let neighborhoods: Vec<Vec<(u32, f32)>> = index.map(points, radius, |me, around| {
-        let mut near = Vec::with_capacity(128);
+    let neighborhoods: Vec<Vec<(u32, f32)>> = index.map(points, radius, |me, around, near: &mut Vec<_>| {
+        near.clear();
         around.within(&points[me], |other, square| {
             if other != me && square > 0.0 {
                 near.push((other as u32, square));
             }
         });
-        near
+        near.clone()
     });
     let simple = simplified_histograms(&neighborhoods, points, normals);
     neighborhoods
@@ -63,19 +63,19 @@ fn simplified_histograms(
     points: &[Point],
     normals: &[Point],
 ) -> Vec<Descriptor> {
-    let pairs: Vec<Vec<(u32, Bins)>> = neighborhoods
-        .par_iter()
-        .enumerate()
-        .map_init(Vec::new, |later, (me, near)| {
-            later.clear();
-            later.extend(near.iter().filter(|(other, _)| *other as usize > me));
-            pair_bins_with(me, later, points, normals)
+    let later = |me: usize| neighborhoods[me].iter().filter(move |(other, _)| *other as usize > me);
+    let pairs: Vec<Vec<Bins>> = (0..neighborhoods.len())
+        .into_par_iter()
+        .map_init(Vec::new, |near, me| {
+            near.clear();
+            near.extend(later(me));
+            pair_bins_with(me, near, points, normals)
         })
         .collect();
     // The last entry takes what has no angles.
     let mut counts = vec![[0_u32; DESCRIPTOR_LEN + 1]; points.len()];
     for (me, pairs) in pairs.iter().enumerate() {
-        for (other, bins) in pairs {
+        for ((other, _), bins) in later(me).zip(pairs) {
             for bin in bins {
                 counts[me][*bin as usize] += 1;
                 counts[*other as usize][*bin as usize] += 1;
@@ -91,7 +91,7 @@ fn simplified_histograms(
 }
 
 /// The bins of a point's angles with each of some neighbours.
-fn pair_bins_with(me: usize, near: &[(u32, f32)], points: &[Point], normals: &[Point]) -> Vec<(u32, Bins)> {
+fn pair_bins_with(me: usize, near: &[(u32, f32)], points: &[Point], normals: &[Point]) -> Vec<Bins> {
     let mut block = Neighbors::default();
     let mut found = Vec::with_capacity(near.len());
     for near in near.chunks(LANES) {
@@ -104,8 +104,8 @@ fn pair_bins_with(me: usize, near: &[(u32, f32)], points: &[Point], normals: &[P
             block.square[lane] = square;
         }
         pair_bins(&normals[me], &mut block);
-        let bins = |lane: usize| block.bins.map(|part| part[lane] as u8);
-        found.extend(near.iter().enumerate().map(|(lane, (other, _))| (*other, bins(lane))));
+        let bins = |lane: usize| std::array::from_fn(|part| block.bins[part][lane] as u8);
+        found.extend((0..near.len()).map(bins));
     }
     found
 }

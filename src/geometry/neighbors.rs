@@ -80,42 +80,32 @@ impl NeighborIndex {
     /// Calls `visit(index, squared distance in m^2)` for every point nearer than `radius` metres, in an order that depends
     /// only on the indexed points and the query. The time grows with the square of `radius` over the index's reach.
     pub fn within(&self, point: &Point, radius: f32, visit: impl FnMut(usize, f32)) {
-        self.around([point], radius).within(point, visit);
+        Surroundings::default().gather(self, [point], radius).within(point, visit);
     }
 
-    /// The moments of the points nearer than `radius` metres.
-    #[must_use]
-    pub fn moments(&self, point: &Point, radius: f32) -> Moments {
-        self.around([point], radius).moments(point)
-    }
-
-    /// What `answer(number of the query, points around it)` says of each query, in their order. Faster than one lookup for each, as
-    /// those that lie near each other share one.
-    pub fn map<T: Send>(
+    /// What `answer(number of the query, points around it, spare)` says of each query, in their order. Faster than one lookup for each, as
+    /// those that lie near each other share one. `spare` is a thing of the caller's, to be used again from query to query: a buffer.
+    pub fn map<T: Send, S: Default>(
         &self,
         queries: &[Point],
         radius: f32,
-        answer: impl Fn(usize, &Surroundings) -> T + Sync,
+        answer: impl Fn(usize, &Surroundings, &mut S) -> T + Sync,
     ) -> Vec<T> {
         let order = sorted_by_cell(queries, self.size);
         let groups: Vec<&[([i64; 3], u32)]> = order.chunk_by(|a, b| a.0 == b.0).collect();
-        let answered: Vec<Vec<(u32, T)>> = groups
+        let answered: Vec<Vec<T>> = groups
             .par_iter()
-            .map_init(Surroundings::default, |around, group| {
-                around.fill(self, group.iter().map(|(_, query)| &queries[*query as usize]), radius);
-                group.iter().map(|(_, query)| (*query, answer(*query as usize, around))).collect()
+            .map_init(<(Surroundings, S)>::default, |(around, spare), group| {
+                around.gather(self, group.iter().map(|(_, query)| &queries[*query as usize]), radius);
+                group.iter().map(|(_, query)| answer(*query as usize, around, spare)).collect()
             })
             .collect();
-        let mut answers: Vec<(u32, T)> = answered.into_iter().flatten().collect();
-        answers.sort_unstable_by_key(|(query, _)| *query);
-        answers.into_iter().map(|(_, answer)| answer).collect()
-    }
-
-    /// What lies within `radius` metres of any of the places.
-    fn around<'p>(&self, places: impl IntoIterator<Item = &'p Point>, radius: f32) -> Surroundings {
-        let mut around = Surroundings::default();
-        around.fill(self, places, radius);
-        around
+        let mut answers: Vec<Option<T>> = queries.iter().map(|_| None).collect();
+        for ((_, query), answer) in order.iter().zip(answered.into_iter().flatten()) {
+            answers[*query as usize] = Some(answer);
+        }
+        // Each query is in one group.
+        answers.into_iter().flatten().collect()
     }
 
     /// Where the points of a cell begin, or of the one after the last.
@@ -144,8 +134,13 @@ impl NeighborIndex {
 }
 
 impl Surroundings {
-    /// Becomes what lies around places. The buffers are used again.
-    fn fill<'p>(&mut self, index: &NeighborIndex, places: impl IntoIterator<Item = &'p Point>, radius: f32) {
+    /// Becomes what lies within `radius` metres of any of some places, with the same buffers.
+    pub fn gather<'p>(
+        &mut self,
+        index: &NeighborIndex,
+        places: impl IntoIterator<Item = &'p Point>,
+        radius: f32,
+    ) -> &Self {
         let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
         for place in places {
             for k in 0..3 {
@@ -175,6 +170,7 @@ impl Surroundings {
         }
         let filled = self.item.len().next_multiple_of(LANES);
         self.position.iter_mut().for_each(|axis| axis.resize(filled, NOWHERE));
+        self
     }
 
     /// Adds a run of points.
@@ -269,7 +265,7 @@ mod tests {
             let index = NeighborIndex::new(&points, reach);
             let mut found = Vec::new();
             index.within(&query, radius, |i, _| found.push(i));
-            let moments = index.moments(&query, radius);
+            let moments = Surroundings::default().gather(&index, [&query], radius).moments(&query);
             prop_assert_eq!(moments.count, found.len());
             let offset = |i: usize, k: usize| f64::from(points[i][k]) - f64::from(query[k]);
             for (at, (k, l)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].into_iter().enumerate() {
@@ -294,17 +290,18 @@ mod tests {
         let points: Vec<Point> = (0..600).map(point).collect();
         let queries: Vec<Point> = (600..900).map(point).map(|p| p.map(|x| x - 0.3)).collect();
         let index = NeighborIndex::new(&points, 1.0);
-        let together = index.map(&queries, 1.2, |query, around| {
-            let mut found = Vec::new();
+        let together = index.map(&queries, 1.2, |query, around, found: &mut Vec<(usize, u32)>| {
+            found.clear();
             around.within(&queries[query], |i, square| found.push((i, square.to_bits())));
-            (query, around.moments(&queries[query]), found)
+            (query, around.moments(&queries[query]), found.clone())
         });
         assert_eq!(together.len(), queries.len());
+        let mut around = Surroundings::default();
         for (query, (number, moments, found)) in together.into_iter().enumerate() {
             let mut alone = Vec::new();
             index.within(&queries[query], 1.2, |i, square| alone.push((i, square.to_bits())));
             assert_eq!((number, found), (query, alone));
-            let single = index.moments(&queries[query], 1.2);
+            let single = around.gather(&index, [&queries[query]], 1.2).moments(&queries[query]);
             assert_eq!(moments.count, single.count);
             let sums = moments.sum.iter().zip(&single.sum);
             for (x, y) in sums.chain(moments.products.iter().zip(&single.products)) {
