@@ -118,6 +118,7 @@ function because(why) {
     ambiguous: () => `ambiguous: support ${n(why.best_support)}, of another pose ${n(why.rival_support)}`,
     contradicted: () => `contradicted: ${why.against} pairs are sure of another pose, ${why.agreeing} were of this one`,
     "violates-free-space": () => `violates free space: ${n(100 * why.violation)} %, allowed ${n(100 * why.allowed)} %`,
+    indistinct: () => `one pair shares little but three planes: ${n(100 * why.beyond_planes)} % beyond them, needed ${n(100 * why.needed)} %`,
     "single-pair": () => `two pieces share one pair alone: support ${n(why.best_support)}`,
     forbidden: () => "forbidden by a decision",
     "too-little-support": () => `too little support: ${n(why.best_support)}, needed ${n(why.needed)}`,

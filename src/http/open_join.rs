@@ -32,7 +32,7 @@ pub(super) struct OpenJoinBody {
     scans_a: usize,
     /// Scans in the smaller piece.
     scans_b: usize,
-    /// Why it was not made: `reason`, a stable word (ambiguous, contradicted, violates-free-space, too-little-support, single-pair,
+    /// Why it was not made: `reason`, a stable word (ambiguous, contradicted, violates-free-space, too-little-support, single-pair, indistinct,
     /// forbidden), and the numbers behind it.
     #[schema(value_type = Object)]
     refusal: Value,

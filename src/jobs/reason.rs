@@ -35,6 +35,9 @@ pub fn reason_of_refusal(refusal: &Refusal) -> Reason {
         Refusal::Violation { found, allowed } => {
             ("violates-free-space", json!({ "violation": found, "allowed": allowed }))
         }
+        Refusal::Indistinct { found, needed } => {
+            ("indistinct", json!({ "beyond_planes": found, "needed": needed }))
+        }
         Refusal::Forbidden => ("forbidden", Value::Null),
         Refusal::SinglePair { support } => ("single-pair", json!({ "best_support": support })),
     };
@@ -68,6 +71,10 @@ mod tests {
             (
                 Refusal::Violation { found: 0.3, allowed: 0.1 },
                 WaitingReason::ViolatesFreeSpace { violation: 0.3, allowed: 0.1 },
+            ),
+            (
+                Refusal::Indistinct { found: 0.02, needed: 0.05 },
+                WaitingReason::Indistinct { beyond_planes: 0.02, needed: 0.05 },
             ),
             (Refusal::Forbidden, WaitingReason::Forbidden),
         ] {

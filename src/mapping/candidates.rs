@@ -49,6 +49,14 @@ pub struct Proposal {
     pub(super) centroid: Vector3<f64>,
 }
 
+impl Proposal {
+    /// Whether its pair has a voice of its own, and not only repeats what third scans say.
+    #[must_use]
+    pub fn has_own_voice(&self) -> bool {
+        self.alone > OWN_VOICE
+    }
+}
+
 /// The best cluster of proposals.
 #[derive(Debug, Clone)]
 pub struct Candidate {
@@ -79,7 +87,7 @@ impl Candidate {
     /// Support by pairs that have a voice of their own, or by a client: third scans that see the same surfaces repeat what one pair says.
     #[must_use]
     pub fn own_support(&self) -> f64 {
-        let own = self.members.iter().filter(|member| member.alone > OWN_VOICE);
+        let own = self.members.iter().filter(|member| member.has_own_voice());
         own.map(|member| member.evidence).sum()
     }
 

@@ -61,6 +61,13 @@ pub enum Refusal {
         /// What the level allows.
         allowed: f64,
     },
+    /// What the scans of the one pair that speaks for it share is little more than three planes: such a corner fits in many places.
+    Indistinct {
+        /// Share of the coinciding points that lie beyond the three largest planes.
+        found: f64,
+        /// The least share.
+        needed: f64,
+    },
     /// A client decided the join, and forbade what it would bring together.
     Forbidden,
     /// Two pieces of several scans each share one pair alone, or what one scan sees little of.

@@ -78,6 +78,7 @@ pub fn more_telling(known: Option<Refusal>, new: Refusal) -> Option<Refusal> {
             Some(
                 Refusal::Violation { .. }
                 | Refusal::Rival { .. }
+                | Refusal::Indistinct { .. }
                 | Refusal::Forbidden
                 | Refusal::SinglePair { .. },
             ),

@@ -48,6 +48,13 @@ pub enum WaitingReason {
         /// Largest share allowed.
         allowed: f64,
     },
+    /// One pair speaks for a place, and what its scans share is little more than three planes, which fit in many places.
+    Indistinct {
+        /// Share of the coinciding points that lie beyond the three largest planes.
+        beyond_planes: f64,
+        /// The least share.
+        needed: f64,
+    },
     /// There is support enough for a place, but a client's decision forbids it.
     Forbidden,
 }

@@ -9,12 +9,16 @@ use crate::features::Scan;
 use crate::geometry::Pose;
 use crate::graph::ScanGraph;
 use crate::optimize::{Correspondence, Correspondences};
-use crate::pairwise::{Contacts, Counts, Motion, PairKey, look, perturbed_about, quick_overlap};
+use crate::pairwise::{
+    Contacts, Counts, Motion, PairKey, look, look_leniently, perturbed_about, quick_overlap,
+};
 
 /// Cosine by which normals of corresponding points agree at least.
 const MIN_NORMAL_DOT: f32 = 0.5;
 /// A pair of scans overlaps when this share of a coarse sample lies on the other.
 const LEAST_OVERLAP: f64 = 0.04;
+/// It sees some of the other with this share.
+const LEAST_SIGHT: f64 = 0.01;
 const COARSE_POINTS: usize = 300;
 /// Pairs and points used to align two components.
 const ALIGN_PAIRS: usize = 16;
@@ -198,6 +202,25 @@ pub fn judge(graph: &ScanGraph, a: &Component, b: &Component, a_from_b: &Pose) -
         .collect::<Vec<_>>()
         .iter()
         .fold(Counts::default(), |sum, counts| sum.plus(counts))
+}
+
+/// What pairs other than some say at half the voxel of a pose of b in a: those that overlap most there, at most so many.
+#[must_use]
+pub fn judge_finely(
+    graph: &ScanGraph,
+    (a, b): (&Component, &Component),
+    a_from_b: &Pose,
+    but: &[PairKey],
+    most: usize,
+) -> Counts {
+    let mut pairs = crossings(graph, a, b, a_from_b);
+    pairs.retain(|p| p.overlap > LEAST_SIGHT && !but.contains(&PairKey::of(p.i.key(), p.j.key())));
+    pairs.truncate(most);
+    let looks: Vec<Option<Counts>> = pairs
+        .par_iter()
+        .map(|p| look_leniently(p.i, p.j, &(p.a_from_i.inverse() * *a_from_b * p.b_from_j)))
+        .collect();
+    looks.iter().flatten().fold(Counts::default(), |sum, counts| sum.plus(counts))
 }
 
 /// What all pairs of scans inside a component say of its poses: how much its own data violate free space where nothing is wrong.

@@ -33,6 +33,9 @@ impl Mapper {
             Some(Refusal::Contradicted { against, agreeing }) => {
                 return WaitingReason::Contradicted { against, agreeing };
             }
+            Some(Refusal::Indistinct { found, needed }) => {
+                return WaitingReason::Indistinct { beyond_planes: found, needed };
+            }
             Some(Refusal::Forbidden) => return WaitingReason::Forbidden,
             Some(Refusal::Support { found, .. } | Refusal::SinglePair { support: found }) => found,
             None => 0.0,

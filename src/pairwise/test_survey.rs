@@ -4,7 +4,9 @@ use nalgebra::{Rotation3, Vector3};
 
 use crate::cloud::ScanKey;
 use crate::control::{CancelToken, Control, Seed, Silent};
-use crate::features::{PrepareOptions, Scan, SensorPosition, choose_resolution, natural_resolution, prepare};
+use crate::features::{
+    PrepareOptions, PreparedScan, Scan, SensorPosition, choose_resolution, natural_resolution, prepare,
+};
 use crate::geometry::Pose;
 use crate::simulate::{BuildingOptions, Layout, Sensor, Survey, SurveyOptions, simulate};
 
@@ -22,6 +24,30 @@ pub(crate) fn prepared(survey: &Survey, resolution: f64) -> Vec<(Scan, Pose)> {
             (Scan::new(prepared), model_from_local)
         })
         .collect()
+}
+
+/// The corner of a room with edges of 4 m along the axes, a point every 5 cm, and the box of this edge in it, metres, if there is one.
+pub(crate) fn corner(key: ScanKey, edge: Option<f32>) -> Scan {
+    let mut prepared = PreparedScan { resolution: 0.05, ..PreparedScan::empty(key) };
+    let mut square = |k: usize, size: f32, offset: f32| {
+        let steps = (size / 0.05) as usize;
+        for at in 0..steps * steps {
+            let mut point = [offset; 3];
+            point[(k + 1) % 3] = 0.025 + (at / steps) as f32 * 0.05;
+            point[(k + 2) % 3] = 0.025 + (at % steps) as f32 * 0.05;
+            let mut normal = [0.0; 3];
+            normal[k] = 1.0;
+            prepared.points.push(point);
+            prepared.normals.push(normal);
+        }
+    };
+    for k in 0..3 {
+        square(k, 4.0, 0.0);
+        if let Some(edge) = edge {
+            square(k, edge, edge);
+        }
+    }
+    Scan::new(prepared)
 }
 
 /// Scans of a near-symmetric hall.

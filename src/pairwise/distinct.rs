@@ -1,0 +1,160 @@
+//! What of the surfaces that two scans share tells their place from others. The corner of one room fits the corner of any other: three planes hold
+//! a pose firmly, and say little of where it is. What coincides beyond the three largest planes says that.
+
+use nalgebra::Vector3;
+
+use crate::features::Scan;
+use crate::geometry::Pose;
+
+/// A point with a point of the other scan this near, in voxels, coincides with it …
+const NEAR_VOXELS: f32 = 1.5;
+/// … if the cosine of their normals is more.
+const SAME_SURFACE: f32 = 0.85;
+/// Points this near a plane, in voxels, belong to it …
+const THICKNESS_VOXELS: f32 = 1.5;
+/// … if the cosine of their normals is more.
+const SAME_PLANE: f32 = 0.9;
+/// Planes that are taken away.
+const PLANES: usize = 3;
+/// Points that are looked at, at most, and points whose planes are tried for each that is taken away: evenly spread.
+const POINTS: usize = 2000;
+const TRIED: usize = 60;
+/// Times that a plane is laid through the middle of its points anew.
+const ROUNDS: usize = 2;
+
+/// Points of two scans that coincide at a pose, of those that were looked at.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Coinciding {
+    /// All of them.
+    pub points: u32,
+    /// Those that lie on none of the three planes that hold most of them.
+    pub beyond_planes: u32,
+}
+
+impl Coinciding {
+    /// Both sets of points together.
+    #[must_use]
+    pub fn plus(&self, other: &Self) -> Self {
+        Self { points: self.points + other.points, beyond_planes: self.beyond_planes + other.beyond_planes }
+    }
+
+    /// Share of the points that lie beyond the three largest planes; 0 without points.
+    #[must_use]
+    pub fn share(&self) -> f64 {
+        f64::from(self.beyond_planes) / f64::from(self.points.max(1))
+    }
+}
+
+/// A point of both scans and its normal, metres, frame of a.
+#[derive(Clone, Copy)]
+struct Surfel {
+    point: Vector3<f32>,
+    normal: Vector3<f32>,
+}
+
+/// What of two scans coincides at a pose (b to a, local frames).
+#[must_use]
+pub fn coinciding(a: &Scan, b: &Scan, a_from_b: &Pose) -> Coinciding {
+    let voxel = a.prepared.resolution as f32;
+    let mut left = shared(a, b, a_from_b, NEAR_VOXELS * voxel);
+    let step = left.len().div_ceil(POINTS).max(1);
+    left = left.into_iter().step_by(step).collect();
+    let points = left.len() as u32;
+    for _ in 0..PLANES {
+        let Some(plane) = largest_plane(&left, THICKNESS_VOXELS * voxel) else { break };
+        left.retain(|surfel| !plane.holds(surfel));
+    }
+    Coinciding { points, beyond_planes: left.len() as u32 }
+}
+
+/// The points of a that points of b coincide with, one for each of these.
+fn shared(a: &Scan, b: &Scan, a_from_b: &Pose, reach: f32) -> Vec<Surfel> {
+    let (of_a, of_b) = (&a.prepared, &b.prepared);
+    let turn = a_from_b.rotation.cast::<f32>();
+    let carried = of_b.points.iter().zip(&of_b.normals);
+    carried
+        .filter_map(|(point, normal)| {
+            let point = a_from_b.transform_point(*point);
+            let at = a.grid.nearest(&point)?;
+            let met = Surfel { point: of_a.points[at].into(), normal: of_a.normals[at].into() };
+            let is_near = (met.point - Vector3::from(point)).norm_squared() < reach * reach;
+            (is_near && met.normal.dot(&(turn * Vector3::from(*normal))) > SAME_SURFACE).then_some(met)
+        })
+        .collect()
+}
+
+/// A plane of some thickness, seen from one side.
+struct Plane {
+    at: Surfel,
+    /// Metres to either side.
+    thickness: f32,
+}
+
+impl Plane {
+    fn holds(&self, surfel: &Surfel) -> bool {
+        let Surfel { point, normal } = &self.at;
+        normal.dot(&surfel.normal) > SAME_PLANE && normal.dot(&(surfel.point - point)).abs() < self.thickness
+    }
+
+    /// The same through the middle of its points, across the mean of their normals.
+    fn settled(&self, surfels: &[Surfel]) -> Self {
+        let (mut point, mut normal, mut count) = (Vector3::zeros(), Vector3::zeros(), 0.0_f32);
+        for surfel in surfels.iter().filter(|surfel| self.holds(surfel)) {
+            point += surfel.point;
+            normal += surfel.normal;
+            count += 1.0;
+        }
+        let at = match normal.try_normalize(f32::MIN_POSITIVE) {
+            Some(normal) => Surfel { point: point / count, normal },
+            None => self.at,
+        };
+        Self { at, ..*self }
+    }
+}
+
+/// The plane that holds most points.
+fn largest_plane(surfels: &[Surfel], thickness: f32) -> Option<Plane> {
+    let step = surfels.len().div_ceil(TRIED).max(1);
+    let count = |plane: &Plane| surfels.iter().filter(|surfel| plane.holds(surfel)).count();
+    let tried = surfels.iter().step_by(step).map(|at| Plane { at: *at, thickness });
+    let (mut best, mut most) = (None, 0);
+    for plane in tried {
+        let held = count(&plane);
+        if held > most {
+            (best, most) = (Some(plane), held);
+        }
+    }
+    (0..ROUNDS).fold(best, |plane, _| plane.map(|plane| plane.settled(surfels)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cloud::ScanKey;
+    use crate::pairwise::test_survey;
+
+    fn corner(edge: Option<f32>) -> Scan {
+        test_survey::corner(ScanKey(1), edge)
+    }
+
+    #[test]
+    fn a_corner_is_three_planes_and_what_stands_in_it_is_not() {
+        let empty = coinciding(&corner(None), &corner(None), &Pose::identity());
+        assert!(empty.points > 1000, "{empty:?}");
+        assert!(empty.share() < 0.01, "only where the planes meet is a normal not quite clear: {empty:?}");
+        let furnished = coinciding(&corner(Some(1.0)), &corner(Some(1.0)), &Pose::identity());
+        let expected = 3.0 / (3.0 + 48.0);
+        assert!((furnished.share() - expected).abs() < 0.01, "{furnished:?}");
+        // What only one of them sees does not coincide.
+        let either = coinciding(&corner(None), &corner(Some(1.0)), &Pose::identity());
+        assert!(either.share() < 0.01, "{either:?}");
+    }
+
+    #[test]
+    fn what_is_apart_does_not_coincide() {
+        let away = Pose::from_translation(Vector3::new(9.0, 9.0, 9.0));
+        let none = coinciding(&corner(None), &corner(None), &away);
+        assert_eq!(none, Coinciding::default());
+        assert_eq!(none.share(), 0.0);
+    }
+}
