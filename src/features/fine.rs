@@ -118,6 +118,11 @@ impl Unpacked {
         }))
     }
 
+    /// Whether it is in memory.
+    pub fn is_held(&self) -> bool {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
     /// Gives its memory back.
     pub fn forget(&self) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = None;
@@ -168,7 +173,9 @@ mod tests {
         let (points, held) = (first.prepared.points.clone(), Arc::downgrade(&first));
         drop(first);
         assert!(held.upgrade().is_some(), "it is kept for whoever asks next");
+        assert!(scan.is_unpacked());
         scan.forget_fine();
+        assert!(!scan.is_unpacked());
         assert!(held.upgrade().is_none(), "nobody holds it any more");
         let again = scan.fine().expect("the room is as dense as before");
         assert_eq!(again.prepared.points, points);

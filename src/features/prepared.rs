@@ -205,6 +205,12 @@ impl Scan {
         self.unpacked.get(&self.prepared)
     }
 
+    /// Whether [`Scan::fine`] holds memory.
+    #[must_use]
+    pub fn is_unpacked(&self) -> bool {
+        self.unpacked.is_held()
+    }
+
     /// Gives back the memory that [`Scan::fine`] took.
     pub fn forget_fine(&self) {
         self.unpacked.forget();

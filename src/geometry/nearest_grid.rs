@@ -209,8 +209,8 @@ const NONE_OFFERED: Offer = (f32::INFINITY.to_bits() as i64) << 32;
 
 #[inline]
 fn packed(square: f32, index: u32) -> Offer {
-    // Bits of numbers that are not negative are in the order of the numbers.
-    (i64::from(square.to_bits()) << 32) | i64::from(index)
+    // Bits of numbers that are not negative are in the order of the numbers, and what is none comes last.
+    (i64::from(square.abs().to_bits()) << 32) | i64::from(index)
 }
 
 /// The point that was offered, or EMPTY.
@@ -344,6 +344,15 @@ mod tests {
             let found = grid.nearest(&centre).map(|index| distance(&points[index], &centre));
             assert_eq!(found, nearest);
         }
+    }
+
+    #[test]
+    fn of_points_as_near_as_each_other_the_first_is_found_and_what_is_no_place_never() {
+        let points = [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5], [-f32::NAN, 0.5, 0.5], [0.7, 0.5, 0.5]];
+        let grid = NearestGrid::new(&points, 0.1);
+        assert_eq!(grid.nearest(&[0.5, 0.5, 0.5]), Some(0));
+        assert_eq!(grid.nearest(&[0.7, 0.5, 0.5]), Some(3));
+        assert!((0..40).all(|i| grid.nearest(&[i as f32 * 0.05, 0.5, 0.5]) != Some(2)));
     }
 
     #[test]

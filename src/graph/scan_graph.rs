@@ -17,6 +17,8 @@ use crate::pairwise::{Hypothesis, PairKey, PairResult, Probe, match_pair, probe}
 
 /// Pairs that are matched before the memory that their second looks took is given back.
 const BLOCK: usize = 512;
+/// Scans whose finer surfaces stay in memory while joins are weighed, at most.
+const UNPACKED: usize = 64;
 
 /// A hypothesis with what third scans say of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -201,6 +203,13 @@ impl ScanGraph {
     pub fn forget_fine(&self) {
         for scan in self.scans.values() {
             scan.forget_fine();
+        }
+    }
+
+    /// The same where more than [`UNPACKED`] scans have taken it.
+    pub fn forget_fine_of_many(&self) {
+        if self.scans.values().filter(|scan| scan.is_unpacked()).count() > UNPACKED {
+            self.forget_fine();
         }
     }
 

@@ -30,7 +30,7 @@ const LEAD: f64 = 1.0;
 /// Edges whose own poses are tried where the fit to all of them fails.
 pub const SINGLE_STARTS: usize = 6;
 
-/// Why a join was not made.
+/// Why a join was not made. Stored by the order of its variants, so new ones come last.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum Refusal {
     /// Too little support, rivals aside.
@@ -58,15 +58,8 @@ pub enum Refusal {
     Violation {
         /// Share of the judged points.
         found: f64,
-        /// What the level allows.
+        /// What is allowed.
         allowed: f64,
-    },
-    /// What the scans of the one pair that speaks for it share is little more than three planes: such a corner fits in many places.
-    Indistinct {
-        /// Share of the coinciding points that lie beyond the three largest planes.
-        found: f64,
-        /// The least share.
-        needed: f64,
     },
     /// A client decided the join, and forbade what it would bring together.
     Forbidden,
@@ -74,6 +67,13 @@ pub enum Refusal {
     SinglePair {
         /// Its support.
         support: f64,
+    },
+    /// What the scans of the one pair that speaks for it share is little more than three planes: such a corner fits in many places.
+    Indistinct {
+        /// Share of the coinciding points that lie beyond the three largest planes.
+        found: f64,
+        /// The least share.
+        needed: f64,
     },
 }
 
@@ -123,6 +123,7 @@ pub fn weigh_join(
         place(graph, (a, b), candidate, &needed, voxel, options)
     };
     for (rank, candidate) in candidates.iter().enumerate() {
+        control.check()?;
         if candidate.support < level.support {
             let refusal = Refusal::Support { found: candidate.support, needed: level.support };
             return Ok(Err(first_refusal.unwrap_or(refusal)));

@@ -11,7 +11,7 @@ use super::open_join::{OpenJoin, Undone};
 use crate::cloud::ScanKey;
 use crate::geometry::Pose;
 
-/// Why a scan is in no component.
+/// Why a scan is in no component. Stored by the order of its variants, so new ones come last.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum WaitingReason {
@@ -48,6 +48,8 @@ pub enum WaitingReason {
         /// Largest share allowed.
         allowed: f64,
     },
+    /// There is support enough for a place, but a client's decision forbids it.
+    Forbidden,
     /// One pair speaks for a place, and what its scans share is little more than three planes, which fit in many places.
     Indistinct {
         /// Share of the coinciding points that lie beyond the three largest planes.
@@ -55,8 +57,6 @@ pub enum WaitingReason {
         /// The least share.
         needed: f64,
     },
-    /// There is support enough for a place, but a client's decision forbids it.
-    Forbidden,
 }
 
 /// Where a scan stands in a model.

@@ -17,8 +17,8 @@ use crate::pairwise::{
 const MIN_NORMAL_DOT: f32 = 0.5;
 /// A pair of scans overlaps when this share of a coarse sample lies on the other.
 const LEAST_OVERLAP: f64 = 0.04;
-/// It sees some of the other with this share.
-const LEAST_SIGHT: f64 = 0.01;
+/// It touches the other with this share.
+const LEAST_TOUCH: f64 = 0.01;
 const COARSE_POINTS: usize = 300;
 /// Pairs and points used to align two components.
 const ALIGN_PAIRS: usize = 16;
@@ -204,7 +204,8 @@ pub fn judge(graph: &ScanGraph, a: &Component, b: &Component, a_from_b: &Pose) -
         .fold(Counts::default(), |sum, counts| sum.plus(counts))
 }
 
-/// What pairs other than some say at half the voxel of a pose of b in a: those that overlap most there, at most so many.
+/// What pairs other than some say at half the voxel of a pose of b in a: those that overlap most there, at most so many. Pairs that would
+/// share no surface are not asked.
 #[must_use]
 pub fn judge_finely(
     graph: &ScanGraph,
@@ -214,7 +215,7 @@ pub fn judge_finely(
     most: usize,
 ) -> Counts {
     let mut pairs = crossings(graph, a, b, a_from_b);
-    pairs.retain(|p| p.overlap > LEAST_SIGHT && !but.contains(&PairKey::of(p.i.key(), p.j.key())));
+    pairs.retain(|p| p.overlap > LEAST_TOUCH && !but.contains(&PairKey::of(p.i.key(), p.j.key())));
     pairs.truncate(most);
     let looks: Vec<Option<Counts>> = pairs
         .par_iter()
