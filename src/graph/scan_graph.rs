@@ -206,7 +206,7 @@ impl ScanGraph {
         }
     }
 
-    /// The same where more than [`UNPACKED`] scans have taken it.
+    /// The same where more than 64 scans have taken it.
     pub fn forget_fine_of_many(&self) {
         if self.scans.values().filter(|scan| scan.is_unpacked()).count() > UNPACKED {
             self.forget_fine();
