@@ -33,8 +33,8 @@ const LEAST_FIRM: usize = 4;
 /// Where fewer points can be judged, nothing can be said.
 const LEAST_JUDGED: u32 = 100;
 /// Of the points that the scans of a single pair share, this share must lie beyond the three largest planes. Of the joins in simulated houses that
-/// rest on one pair, one right of 519 has less, and a wrong one along a bare wall that nothing else gave away; in real rooms right ones have 1.1 %
-/// and more.
+/// rest on one pair, one right of 519 has less, and a wrong one along a bare wall that nothing else gave away; right pairs of walls in a real room
+/// have 2.1 %.
 const LEAST_BEYOND_PLANES: f64 = 0.01;
 
 /// A pair that says something for a join.
@@ -46,6 +46,12 @@ struct Word<'g> {
     y: &'g Scan,
     /// Where the join would have them, local frames.
     x_from_y: Pose,
+}
+
+impl Word<'_> {
+    fn pair(&self) -> PairKey {
+        PairKey::of(self.proposal.in_a, self.proposal.in_b)
+    }
 }
 
 /// What is wrong with a join of b to a at this pose, which so many edges speak for, if anything is.
@@ -81,8 +87,7 @@ fn violation(graph: &ScanGraph, words: &[Word<'_>]) -> Option<Refusal> {
     if seen.inliers + seen.violations < LEAST_JUDGED || found <= MOST_VIOLATION {
         return None;
     }
-    let pairs: Vec<PairKey> =
-        words.iter().map(|word| PairKey::of(word.proposal.in_a, word.proposal.in_b)).collect();
+    let pairs: Vec<PairKey> = words.iter().map(Word::pair).collect();
     let allowed = MOST_VIOLATION.max(CONTRAST * usual(graph, &pairs).unwrap_or(0.0));
     (found > allowed).then_some(Refusal::Violation { found, allowed })
 }
@@ -113,8 +118,7 @@ fn trespass(
     if voices > MOST_VOICES || lone.len() > 1 || rest.len() == 1 {
         return None;
     }
-    let own: Vec<PairKey> =
-        words.iter().map(|word| PairKey::of(word.proposal.in_a, word.proposal.in_b)).collect();
+    let own: Vec<PairKey> = words.iter().map(Word::pair).collect();
     let points = graph.scan(lone.gauge)?.prepared.fine.as_ref()?.count();
     let seen = judge_finely(graph, (a, b), a_from_b, &own, SILENT);
     let (found, judged) = (seen.violation_share(), seen.inliers + seen.violations);

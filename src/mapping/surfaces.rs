@@ -283,7 +283,7 @@ impl<'g> ComponentSurfaces<'g> {
                     return false;
                 }
                 let x_from_y = x_pose.inverse() * *y_pose;
-                coarse_overlap(x, y, &x_from_y).max(coarse_overlap(y, x, &x_from_y.inverse())) > LEAST_OVERLAP
+                coarse_overlap_of_either(x, y, &x_from_y) > LEAST_OVERLAP
             })
             .flat_map_iter(|&(i, j)| [(i, j), (j, i)])
             .collect();
