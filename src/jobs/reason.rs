@@ -26,7 +26,7 @@ pub fn reason_of_refusal(refusal: &Refusal) -> Reason {
         Refusal::Support { found, needed } => {
             ("too-little-support", json!({ "best_support": found, "needed": needed }))
         }
-        Refusal::Rival { support, rival } => {
+        Refusal::Rival { support, rival } | Refusal::Torn { support, rival } => {
             ("ambiguous", json!({ "best_support": support, "rival_support": rival }))
         }
         Refusal::Contradicted { against, agreeing } => {
@@ -62,6 +62,10 @@ mod tests {
         for (refusal, reason) in [
             (
                 Refusal::Rival { support: 3.0, rival: 2.5 },
+                WaitingReason::Ambiguous { best_support: 3.0, rival_support: 2.5 },
+            ),
+            (
+                Refusal::Torn { support: 3.0, rival: 2.5 },
                 WaitingReason::Ambiguous { best_support: 3.0, rival_support: 2.5 },
             ),
             (

@@ -91,6 +91,12 @@ impl Candidate {
         own.map(|member| member.evidence).sum()
     }
 
+    /// Log-odds of its pairs by themselves, all together, without limit; those that doubt it take nothing away.
+    #[must_use]
+    pub fn alone(&self) -> f64 {
+        self.members.iter().map(|member| member.alone.max(0.0)).sum()
+    }
+
     /// The log-odds of the pair that is surest by itself.
     #[must_use]
     pub fn surest(&self) -> f64 {

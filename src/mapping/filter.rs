@@ -35,7 +35,7 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<usize, Cancelled> {
         let mut misplaced: Vec<ScanKey> = Vec::new();
-        let mut torn: Vec<ScanKey> = Vec::new();
+        let mut torn: Vec<(ScanKey, Refusal)> = Vec::new();
         for (index, component) in self.components.iter().enumerate().filter(|(_, c)| c.len() >= FILTER_FROM) {
             // Poses are all that is asked of the rest.
             let mut rest = Component {
@@ -60,18 +60,19 @@ impl Mapper {
                 let others = self.components.iter().enumerate().filter(|(other, _)| *other != index);
                 let held = held_by_client(component, *scan, options);
                 let in_another = || {
-                    let mut bests =
+                    let bests =
                         others.filter_map(|(_, other)| best_candidate(graph, other, &single, voxel, options));
-                    bests.any(|best| better(&best))
+                    most(bests.filter(better))
+                };
+                let claimed = || {
+                    let loosely = if own < options.firm_support { in_another() } else { None };
+                    loosely.or_else(|| self.tears((index, component), &single, own, graph, voxel, options))
                 };
                 if elsewhere {
                     misplaced.push(*scan);
-                } else if !held
-                    && (own < options.firm_support && in_another()
-                        || self.is_torn((index, component), &single, own, graph, voxel, options))
-                {
+                } else if !held && let Some(rival) = claimed() {
                     misplaced.push(*scan);
-                    torn.push(*scan);
+                    torn.push((*scan, Refusal::Torn { support: own, rival }));
                 }
             }
         }
@@ -83,15 +84,19 @@ impl Mapper {
             self.add_waiting(*scan);
         }
         // Places that look alike, such as the ends of a hall, pull at them from both sides: it is open where they belong.
-        self.set_aside.extend(torn);
+        for (scan, refusal) in torn {
+            self.set_aside.insert(scan);
+            self.waiting.insert(scan, Some(refusal));
+        }
         self.dissolve_small();
         Ok(misplaced.len())
     }
 }
 
 impl Mapper {
-    /// Whether a scan, which has this support in its component, has nearly as much, and firmly, in another that does not fit it: both cannot be right.
-    fn is_torn(
+    /// The support that a scan, which has this much in its component, has in another that does not fit that, if it is nearly as much, and firm: both
+    /// cannot be right.
+    fn tears(
         &self,
         (index, component): (usize, &Component),
         single: &Component,
@@ -99,18 +104,23 @@ impl Mapper {
         graph: &ScanGraph,
         voxel: f64,
         options: &MappingOptions,
-    ) -> bool {
+    ) -> Option<f64> {
         let others = self.components.iter().enumerate().filter(|(other, _)| *other != index);
-        let mut apart = others.filter(|(_, other)| {
+        let apart = others.filter(|(_, other)| {
             let refusal = self.refused.get(Link::between(component.gauge, other.gauge));
             matches!(refusal, Some(Refusal::Violation { .. } | Refusal::Rival { .. }))
         });
-        apart.any(|(_, other)| {
-            best_candidate(graph, other, single, voxel, options).is_some_and(|best| {
-                best.rests_on_several() && best.support > options.firm_support.max(NEARLY_AS_MUCH * own)
-            })
-        })
+        let bests = apart.filter_map(|(_, other)| best_candidate(graph, other, single, voxel, options));
+        let tears = |best: &Candidate| {
+            best.rests_on_several() && best.support > options.firm_support.max(NEARLY_AS_MUCH * own)
+        };
+        most(bests.filter(tears))
     }
+}
+
+/// The support of that candidate which has most.
+fn most(candidates: impl Iterator<Item = Candidate>) -> Option<f64> {
+    candidates.map(|candidate| candidate.support).max_by(f64::total_cmp)
 }
 
 /// Whether a client joined a scan to another of its component.
@@ -212,7 +222,12 @@ mod tests {
         let refused = Refused { support: 8.0, needed: 8.0, refusal };
         mapper.refused.insert(Link::between(ScanKey(1), ScanKey(5)), refused);
         assert_eq!(filtered(&mut mapper), Ok(1));
-        assert!(mapper.set_aside.contains(&ScanKey(8)) && mapper.waiting.contains_key(&ScanKey(8)));
+        assert!(mapper.set_aside.contains(&ScanKey(8)));
+        let said = mapper.waiting[&ScanKey(8)];
+        assert!(
+            matches!(said, Some(Refusal::Torn { support, rival }) if support > 0.0 && rival > 4.0),
+            "{said:?}"
+        );
         assert_eq!(mapper.components.iter().map(Component::len).collect::<Vec<_>>(), [4, 3]);
     }
 }

@@ -68,12 +68,20 @@ pub enum Refusal {
         /// Its support.
         support: f64,
     },
-    /// What the scans of the one pair that speaks for it share is little more than three planes: such a corner fits in many places.
+    /// What the scans of all pairs that have a voice for it share is little more than three planes: such a corner fits in many places. Or one weak pair alone
+    /// speaks for it, and shows no more than that.
     Indistinct {
-        /// Share of the coinciding points that lie beyond the three largest planes.
+        /// Share of the coinciding points that lie beyond the three largest planes, the most of any pair.
         found: f64,
         /// The least share.
         needed: f64,
+    },
+    /// Two components that do not fit each other have about as much for it.
+    Torn {
+        /// Support in the one that it was taken out of.
+        support: f64,
+        /// The most support in another.
+        rival: f64,
     },
 }
 
@@ -133,14 +141,22 @@ pub fn weigh_join(
             continue;
         }
         let own = candidate.own_support();
-        if strictest && own < level.support {
+        // Third scans do not make a join of what no pair believes by itself.
+        if strictest && own < level.support || !weighed_again && own <= 0.0 {
             first_refusal = first_refusal.or(Some(Refusal::Support { found: own, needed: level.support }));
             continue;
         }
         match place(candidate, level.support, if several { 2 } else { 1 }) {
             Ok(placed) => {
                 if !weighed_again
-                    && let Some(refusal) = objection(graph, (a, b), candidate, placed.edges, &placed.a_from_b)
+                    && let Some(refusal) = objection(
+                        graph,
+                        (a, b),
+                        candidate,
+                        Backing { support: placed.support, edges: placed.edges },
+                        &placed.a_from_b,
+                        options,
+                    )
                 {
                     first_refusal = first_refusal.or(Some(refusal));
                     continue;
@@ -358,6 +374,14 @@ mod tests {
         let one_voice = joined(&[&talked_up(-3.0)[..], &others].concat());
         assert_eq!(one_voice[0], Err(Refusal::Support { found: 4.0, needed: 8.0 }));
         assert!(one_voice[1].is_ok(), "{one_voice:?}");
+    }
+
+    #[test]
+    fn third_scans_join_nothing_that_no_pair_believes_by_itself() {
+        let all = |logit| joined(&(1..=5).map(|k| ((k, 6), true, logit)).collect::<Vec<_>>());
+        let last = |results: Vec<Result<Pose, Refusal>>| results.last().copied();
+        assert!(matches!(last(all(-0.9)), Some(Ok(_))), "{:?}", all(-0.9));
+        assert_eq!(last(all(-1.1)), Some(Err(Refusal::Support { found: 0.0, needed: 1.5 })));
     }
 
     #[test]

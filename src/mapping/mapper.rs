@@ -16,6 +16,7 @@ use super::refine::{Reach, dense, local_bundle_adjustment, neighborhood};
 use super::refusals::{Link, Refusals, Refused, more_telling};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control};
+use crate::geometry::Pose;
 use crate::graph::ScanGraph;
 
 /// A waiting scan that could be registered.
@@ -44,7 +45,8 @@ pub struct Mapper {
     pub joins_since_refinement: usize,
     /// Scans of components that were taken apart because their pairs contradict each other.
     pub(super) doubted: BTreeSet<ScanKey>,
-    /// Scans of which it is open where they belong: they wait until all is decided anew, and say nothing of the rest.
+    /// Scans of which it is open where they belong: they wait until all is decided anew, or their own pairs settle it at the end, and say nothing of the
+    /// rest.
     pub(super) set_aside: BTreeSet<ScanKey>,
     /// Placements taken back since the model was last decided anew.
     pub undone: Vec<Undone>,
@@ -101,17 +103,7 @@ impl Mapper {
             }
             match weigh_join(graph, (component, &single), &next.candidates, level, voxel, options, control)? {
                 Ok(a_from_b) => {
-                    self.waiting.remove(&next.scan);
-                    let component = &mut self.components[next.component];
-                    component.absorb(single, &a_from_b, graph, options);
-                    let free = neighborhood(component, next.scan, options);
-                    guarded(graph, component, options, |component| {
-                        local_bundle_adjustment(component, next.scan, voxel, options, control)
-                    })?;
-                    guarded(graph, component, options, |component| {
-                        dense(graph, component, Some(&free), Reach::NEAR, voxel, control).map(drop)
-                    })?;
-                    self.joins_since_refinement += 1;
+                    self.take_in((next.component, single), &a_from_b, graph, voxel, options, control)?;
                     return Ok(Some(next.scan));
                 }
                 Err(refusal) => {
@@ -122,6 +114,31 @@ impl Mapper {
             }
         }
         Ok(None)
+    }
+
+    /// Joins a waiting scan to a component, and adjusts it and what is around it.
+    pub(super) fn take_in(
+        &mut self,
+        (index, single): (usize, Component),
+        component_from_scan: &Pose,
+        graph: &ScanGraph,
+        voxel: f64,
+        options: &MappingOptions,
+        control: Control<'_>,
+    ) -> Result<(), Cancelled> {
+        let scan = single.gauge;
+        self.waiting.remove(&scan);
+        let component = &mut self.components[index];
+        component.absorb(single, component_from_scan, graph, options);
+        let free = neighborhood(component, scan, options);
+        guarded(graph, component, options, |component| {
+            local_bundle_adjustment(component, scan, voxel, options, control)
+        })?;
+        guarded(graph, component, options, |component| {
+            dense(graph, component, Some(&free), Reach::NEAR, voxel, control).map(drop)
+        })?;
+        self.joins_since_refinement += 1;
+        Ok(())
     }
 
     /// Waiting scans that pass a level's support against some component; those that see most landmarks first.

@@ -34,6 +34,7 @@ mod policy;
 mod reclaim;
 mod refine;
 mod refusals;
+mod settle;
 mod snapshot;
 mod surfaces;
 #[cfg(test)]

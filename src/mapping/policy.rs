@@ -7,7 +7,7 @@
 //! Where the pairs that it tries show that right poses are rarer than it seemed, all is joined anew.
 //! Only firm joins are made before all pairs that retrieval proposes were tried: a weak one is weighed with all that can be known. Where
 //! alike places were found, none but those of the strictest level are made from then on, which no single pair passes. Pieces that a single weak pair, or one scan that sees little, turns out to hold together
-//! are parted at the end, unless others bear the latter out. What is left waits.
+//! are parted at the end, unless others bear the latter out; and before that, scans that components tore at are settled where their own pairs say clearly which is right. What is left waits.
 
 use std::collections::BTreeSet;
 
@@ -84,6 +84,7 @@ pub fn grow(
             break;
         }
     }
+    mapper.settle(graph, voxel, &options, control)?;
     mapper.part_at_bridges(graph, &options, control)?;
     if mapper.refinement_is_due(&options) {
         mapper.refine(graph, voxel, &options, control)?;

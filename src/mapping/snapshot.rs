@@ -26,11 +26,12 @@ pub enum WaitingReason {
         /// Support that a join needs.
         needed: f64,
     },
-    /// Candidate poses exist, but two different ones are about equally good, or a pair is surer of the second than any of the first.
+    /// Candidate poses exist, but two different ones are about equally good, or a pair is surer of the second than any of the first, or two components
+    /// that do not fit each other have about as much for it.
     Ambiguous {
-        /// Support of the best candidate pose.
+        /// Support of the best candidate pose, or of the place that it had.
         best_support: f64,
-        /// Support of the best different pose.
+        /// Support of the best different pose, or in the other component.
         rival_support: f64,
     },
     /// It was placed, and then too many pairs were sure of other poses: alike places were taken for one. A decision, or a scan that
@@ -50,9 +51,10 @@ pub enum WaitingReason {
     },
     /// There is support enough for a place, but a client's decision forbids it.
     Forbidden,
-    /// One pair speaks for a place, and what its scans share is little more than three planes, which fit in many places.
+    /// What the scans of all pairs that speak for a place share is little more than three planes, which fit in many places; or one weak pair alone speaks for it, and
+    /// shows no more than that.
     Indistinct {
-        /// Share of the coinciding points that lie beyond the three largest planes.
+        /// Share of the coinciding points that lie beyond the three largest planes, the most of any pair.
         beyond_planes: f64,
         /// The least share.
         needed: f64,

@@ -22,9 +22,9 @@ impl Mapper {
         if graph.scans().len() < 2 {
             return WaitingReason::OnlyScan;
         }
-        let needed = options.levels.last().map_or(0.0, |l| l.support);
-        let best_support = match self.waiting.get(&scan).copied().flatten() {
-            Some(Refusal::Rival { support, rival }) => {
+        let least = options.levels.last().map_or(0.0, |l| l.support);
+        let (best_support, needed) = match self.waiting.get(&scan).copied().flatten() {
+            Some(Refusal::Rival { support, rival } | Refusal::Torn { support, rival }) => {
                 return WaitingReason::Ambiguous { best_support: support, rival_support: rival };
             }
             Some(Refusal::Violation { found, allowed }) => {
@@ -37,10 +37,12 @@ impl Mapper {
                 return WaitingReason::Indistinct { beyond_planes: found, needed };
             }
             Some(Refusal::Forbidden) => return WaitingReason::Forbidden,
-            Some(Refusal::Support { found, .. } | Refusal::SinglePair { support: found }) => found,
-            None => 0.0,
+            // Enough for the most lenient join, but not for what this would be.
+            Some(Refusal::Support { found, needed }) if found >= least => (found, needed),
+            Some(Refusal::Support { found, .. } | Refusal::SinglePair { support: found }) => (found, least),
+            None => (0.0, least),
         };
-        if self.only_a_ban_keeps_out(scan, graph, voxel, needed, options) {
+        if self.only_a_ban_keeps_out(scan, graph, voxel, least, options) {
             return WaitingReason::Forbidden;
         }
         let tried = graph.neighbors(scan).count();
