@@ -1,34 +1,36 @@
 //! Surface normals by principal components of neighbourhoods.
 
-use crate::geometry::{Moments, NeighborIndex, Point, Spread, Surroundings};
+use crate::geometry::{Moments, NeighborIndex, Point, Spread};
 
 /// Fewest neighbours that give a plane.
-const MIN_NEIGHBORS: usize = 6;
-/// Wider radii that are tried in turn, as multiples of the first: sparse parts of a scan need a wider look.
-const WIDENING: [f32; 2] = [1.5, 2.25];
+const MIN_NEIGHBORS: u32 = 6;
+/// Radii that are tried in turn, as multiples of the one asked for: sparse parts of a scan need a wider look.
+const WIDENING: [f32; 3] = [1.0, 1.5, 2.25];
 
 /// The unit normal at each of `at`, from the points of `index` within `radius` metres, or `None`
 /// where too few points are near or they lie on a line. The sign is arbitrary: see [`face`].
 #[must_use]
 pub fn normals(at: &[Point], index: &NeighborIndex, radius: f32) -> Vec<Option<Point>> {
-    index.map(at, radius, |query, around, spare: &mut Surroundings| {
-        let place = &at[query];
-        let mut wider =
-            |widening: &f32| normal(&spare.gather(index, [place], radius * widening).moments(place));
-        normal(&around.moments(place)).or_else(|| WIDENING.iter().find_map(&mut wider))
-    })
+    let mut normals = vec![None; at.len()];
+    let mut without: Vec<usize> = (0..at.len()).collect();
+    for widening in WIDENING {
+        let places: Vec<Point> = without.iter().map(|place| at[*place]).collect();
+        let found = index.map_moments(&places, radius * widening, |near| {
+            near.iter().zip(Spread::of_all(near)).map(|(near, spread)| normal(near, &spread)).collect()
+        });
+        for (place, normal) in without.iter().zip(found) {
+            normals[*place] = normal;
+        }
+        without.retain(|place| normals[*place].is_none());
+    }
+    normals
 }
 
-fn normal(near: &Moments) -> Option<Point> {
-    if near.count < MIN_NEIGHBORS {
-        return None;
-    }
-    let Spread { values: [smallest, middle, largest], least } = Spread::of(near);
+fn normal(near: &Moments, spread: &Spread) -> Option<Point> {
+    let Spread { values: [smallest, middle, largest], least } = spread;
     // On a line the two smaller spreads vanish alike and the normal is free to spin.
-    if !(middle > 1e-3 * largest && middle > 1.5 * smallest.max(0.0)) {
-        return None;
-    }
-    Some(least.cast().into())
+    let is_plane = *middle > 1e-3 * largest && *middle > 1.5 * smallest.max(0.0);
+    (near.count >= MIN_NEIGHBORS && is_plane).then(|| least.cast().into())
 }
 
 /// Turns `normal` so that it faces `viewpoint` as seen from `at`.

@@ -25,13 +25,13 @@ pub struct FineSurface {
     low: Point,
     /// A step of a packed coordinate, metres.
     step: f32,
-    surfels: Vec<Surfel>,
+    surfels: Vec<PackedSurfel>,
     range_image: RangeImage,
 }
 
 /// A point in steps from the lowest, and the direction that its surface faces.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-struct Surfel {
+struct PackedSurfel {
     position: [u16; 3],
     normal: [i8; 3],
 }
@@ -55,7 +55,7 @@ impl FineSurface {
         if points.is_empty() || points.len() > MOST || step > LARGEST_STEP * resolution {
             return None;
         }
-        let surfels = points.iter().zip(normals).map(|(point, normal)| Surfel {
+        let surfels = points.iter().zip(normals).map(|(point, normal)| PackedSurfel {
             position: std::array::from_fn(|k| ((point[k] - low[k]) / step).round() as u16),
             normal: normal.map(|x| (x * UNIT).round() as i8),
         });

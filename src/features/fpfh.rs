@@ -3,9 +3,9 @@
 //! Bhattacharyya coefficient of their histograms, between 0 and 1.
 
 use multiversion::multiversion;
-use rayon::prelude::*;
 
-use crate::geometry::{NeighborIndex, Point};
+use super::surfel::Surfel;
+use crate::geometry::{NeighborIndex, Pairs, Point, whole};
 
 const BINS: usize = 11;
 /// Numbers in a descriptor: three histograms of eleven bins.
@@ -14,104 +14,99 @@ pub const DESCRIPTOR_LEN: usize = 3 * BINS;
 /// One descriptor, of unit length.
 pub type Descriptor = [f32; DESCRIPTOR_LEN];
 
+/// Histograms while they are summed, with zeros behind them: whole vectors of any processor.
+type Row = [f32; ROW];
+const ROW: usize = DESCRIPTOR_LEN.next_multiple_of(16);
+/// Histograms of neighbours that are added at a time.
+const SUMMANDS: usize = 4;
+
 /// The descriptors of all points, from neighbours within `radius` metres. `normals` are unit vectors that face the sensor,
 /// one a point. A point without neighbours gets the zero descriptor, which matches nothing.
 #[must_use]
 pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor> {
     let index = NeighborIndex::new(points, radius);
-    let neighborhoods: Vec<Vec<(u32, f32)>> = index.map(points, radius, |me, around, near: &mut Vec<_>| {
-        near.clear();
-        around.within(&points[me], |other, square| {
-            if other != me && square > 0.0 {
-                near.push((other as u32, square));
-            }
-        });
-        near.clone()
-    });
-    let simple = simplified_histograms(&neighborhoods, points, normals);
-    neighborhoods
-        .par_iter()
-        .enumerate()
-        .map(|(me, near)| {
-            let mut sum = weighted_sum(near, &simple);
-            normalise_histograms(&mut sum);
-            for (total, x) in sum.iter_mut().zip(&simple[me]) {
-                *total += x;
-            }
-            hellinger(sum)
-        })
-        .collect()
+    // What two points are to each other is the same from either side: each pair is looked at once.
+    let pairs = index.pairs(radius);
+    let surfel = |item: &u32| Surfel { position: points[*item as usize], normal: normals[*item as usize] };
+    let surfels: Vec<Surfel> = index.order().iter().map(surfel).collect();
+    let simple = simplified_histograms(&pairs, &surfels);
+    let sums = weighted_sums(&pairs, &simple);
+    let mut descriptors = vec![[0.0; DESCRIPTOR_LEN]; points.len()];
+    for ((item, mut sum), simple) in index.order().iter().zip(sums).zip(&simple) {
+        normalise_histograms(&mut sum);
+        descriptors[*item as usize] = hellinger(std::array::from_fn(|k| sum[k] + simple[k]));
+    }
+    descriptors
 }
 
-/// The sum of the neighbours' histograms, each weighted by its inverse squared distance.
+/// For each point the sum of its neighbours' histograms, each weighted by its inverse squared distance.
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
-fn weighted_sum(near: &[(u32, f32)], simple: &[Descriptor]) -> Descriptor {
-    let mut sum = [0.0; DESCRIPTOR_LEN];
-    for &(other, square) in near {
-        let weight = 1.0 / square;
-        for (total, x) in sum.iter_mut().zip(&simple[other as usize]) {
-            *total += weight * x;
+fn weighted_sums(pairs: &Pairs, simple: &[Row]) -> Vec<Row> {
+    const NOTHING: Row = [0.0; ROW];
+    let mut sums = vec![NOTHING; simple.len()];
+    for (me, partners) in pairs.by_point().enumerate() {
+        let mine = &simple[me];
+        let mut sum = NOTHING;
+        // Several at once, as each addition to the sum waits for the last.
+        for some in partners.chunks(SUMMANDS) {
+            let mut weights = [0.0; SUMMANDS];
+            let mut theirs = [&NOTHING; SUMMANDS];
+            for (at, &(other, square)) in some.iter().enumerate() {
+                // What is in the same place has no weight, as it has no angles.
+                weights[at] = if square > 0.0 { 1.0 / square } else { 0.0 };
+                theirs[at] = &simple[other as usize];
+                let their_sum = &mut sums[other as usize];
+                for k in 0..ROW {
+                    their_sum[k] += weights[at] * mine[k];
+                }
+            }
+            let [a, b, c, d] = theirs;
+            for k in 0..ROW {
+                let first = weights[0] * a[k] + weights[1] * b[k];
+                sum[k] += first + (weights[2] * c[k] + weights[3] * d[k]);
+            }
+        }
+        for (total, x) in sums[me].iter_mut().zip(&sum) {
+            *total += x;
         }
     }
-    sum
+    sums
 }
 
-/// The SPFH of all points: angles between the normals of each and of its neighbours and the lines between them. Two neighbours have
-/// the same angles, whichever is asked, so these are computed once.
-fn simplified_histograms(
-    neighborhoods: &[Vec<(u32, f32)>],
-    points: &[Point],
-    normals: &[Point],
-) -> Vec<Descriptor> {
-    let later = |me: usize| neighborhoods[me].iter().filter(move |(other, _)| *other as usize > me);
-    let pairs: Vec<Vec<Bins>> = (0..neighborhoods.len())
-        .into_par_iter()
-        .map_init(Vec::new, |near, me| {
-            near.clear();
-            near.extend(later(me));
-            pair_bins_with(me, near, points, normals)
-        })
-        .collect();
-    // The last entry takes what has no angles.
-    let mut counts = vec![[0_u32; DESCRIPTOR_LEN + 1]; points.len()];
-    for (me, pairs) in pairs.iter().enumerate() {
-        for ((other, _), bins) in later(me).zip(pairs) {
-            for bin in bins {
-                counts[me][*bin as usize] += 1;
-                counts[*other as usize][*bin as usize] += 1;
+/// The SPFH of all points: angles between the normals of each and of its neighbours and the lines between them.
+fn simplified_histograms(pairs: &Pairs, surfels: &[Surfel]) -> Vec<Row> {
+    // The entry after the last takes what has no angles.
+    let mut counts = vec![[0_u32; DESCRIPTOR_LEN + 1]; surfels.len()];
+    let mut block = Neighbors::default();
+    for (me, partners) in pairs.by_point().enumerate() {
+        // Two in turns, as an addition to an entry waits for the last one to it.
+        let mut mine = [[0_u32; DESCRIPTOR_LEN + 1]; 2];
+        for some in partners.chunks(LANES) {
+            block.fill(&surfels[me], some, surfels);
+            pair_bins(&surfels[me].normal, &mut block);
+            for (lane, &(other, _)) in some.iter().enumerate() {
+                let theirs = &mut counts[other as usize];
+                for bins in &block.bins {
+                    let bin = bins[lane] as usize;
+                    mine[lane % 2][bin] += 1;
+                    theirs[bin] += 1;
+                }
             }
+        }
+        for (total, count) in counts[me].iter_mut().zip(mine[0].iter().zip(&mine[1])) {
+            *total += count.0 + count.1;
         }
     }
     let histogram = |counts: &[u32; DESCRIPTOR_LEN + 1]| {
-        let mut histogram = std::array::from_fn(|k| counts[k] as f32);
-        normalise_histograms(&mut histogram);
-        histogram
-    };
-    counts.par_iter().map(histogram).collect()
-}
-
-/// The bins of a point's angles with each of some neighbours.
-fn pair_bins_with(me: usize, near: &[(u32, f32)], points: &[Point], normals: &[Point]) -> Vec<Bins> {
-    let mut block = Neighbors::default();
-    let mut found = Vec::with_capacity(near.len());
-    for near in near.chunks(LANES) {
-        for (lane, &(other, square)) in near.iter().enumerate() {
-            let other = other as usize;
-            for k in 0..3 {
-                block.offset[k][lane] = points[other][k] - points[me][k];
-                block.normal[k][lane] = normals[other][k];
-            }
-            block.square[lane] = square;
+        let mut row = [0.0; ROW];
+        for (x, count) in row[..DESCRIPTOR_LEN].iter_mut().zip(counts) {
+            *x = *count as f32;
         }
-        pair_bins(&normals[me], &mut block);
-        let bins = |lane: usize| std::array::from_fn(|part| block.bins[part][lane] as u8);
-        found.extend((0..near.len()).map(bins));
-    }
-    found
+        normalise_histograms(&mut row);
+        row
+    };
+    counts.iter().map(histogram).collect()
 }
-
-/// The numbers of the descriptor that the three angles of a pair fall into, or [`DESCRIPTOR_LEN`] for none.
-type Bins = [u8; 3];
 
 /// Neighbours of a point that are taken together.
 const LANES: usize = 16;
@@ -124,8 +119,22 @@ struct Neighbors {
     /// Square of that distance, square metres.
     square: [f32; LANES],
     normal: [[f32; LANES]; 3],
-    /// The result: [`Bins`] of each.
+    /// The result: the numbers of the descriptor that the three angles of each fall into, or [`DESCRIPTOR_LEN`] for none.
     bins: [[u32; LANES]; 3],
+}
+
+impl Neighbors {
+    /// Takes some partners of a point in.
+    fn fill(&mut self, of: &Surfel, partners: &[(u32, f32)], surfels: &[Surfel]) {
+        for (lane, &(other, square)) in partners.iter().take(LANES).enumerate() {
+            let other = &surfels[other as usize];
+            for k in 0..3 {
+                self.offset[k][lane] = other.position[k] - of.position[k];
+                self.normal[k][lane] = other.normal[k];
+            }
+            self.square[lane] = square;
+        }
+    }
 }
 
 /// The three angles of a Darboux frame, of each neighbour, as bins. The point whose normal is closer to the line between
@@ -148,12 +157,13 @@ fn pair_bins(mine: &Point, block: &mut Neighbors) {
         let (ux, uy, uz) = if from_mine { (mx, my, mz) } else { (nx[k], ny[k], nz[k]) };
         let (vx, vy, vz) = (dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux);
         let length = (vx * vx + vy * vy + vz * vz).sqrt();
+        let per_length = 1.0 / length;
         let triple = (dy * mz - dz * my) * nx[k] + (dz * mx - dx * mz) * ny[k] + (dx * my - dy * mx) * nz[k];
         let between = mx * nx[k] + my * ny[k] + mz * nz[k];
         // w . t = (d - u (d . u)) . t / |d x u|
-        let theta = half_turns((along_target - phi * between) / length, between);
+        let theta = half_turns((along_target - phi * between) * per_length, between);
         let determined = length >= 1e-6;
-        let angles = [triple / length, phi, theta];
+        let angles = [triple * per_length, phi, theta];
         for (part, angle) in angles.into_iter().enumerate() {
             let bin = (part * BINS) as u32 + bin(angle);
             block.bins[part][k] = if determined { bin } else { DESCRIPTOR_LEN as u32 };
@@ -164,7 +174,7 @@ fn pair_bins(mine: &Point, block: &mut Neighbors) {
 /// The bin of a value in [-1, 1].
 #[inline]
 fn bin(value: f32) -> u32 {
-    ((value + 1.0) * 0.5 * BINS as f32).clamp(0.0, BINS as f32 - 1.0) as u32
+    whole(((value + 1.0) * 0.5 * BINS as f32).clamp(0.0, BINS as f32 - 1.0)).min(BINS as u32 - 1)
 }
 
 /// atan2(y, x) / pi to within 1e-6, in arithmetic that runs on many numbers at once.
@@ -195,8 +205,8 @@ fn half_turns(y: f32, x: f32) -> f32 {
     if y < 0.0 { -upper } else { upper }
 }
 
-fn normalise_histograms(descriptor: &mut Descriptor) {
-    for part in descriptor.chunks_exact_mut(BINS) {
+fn normalise_histograms(row: &mut Row) {
+    for part in row[..DESCRIPTOR_LEN].chunks_exact_mut(BINS) {
         let sum: f32 = part.iter().sum();
         if sum > 0.0 {
             for x in part {

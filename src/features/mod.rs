@@ -12,6 +12,7 @@ mod resolution;
 mod sensor;
 mod signature;
 mod similarity;
+mod surfel;
 
 pub use fine::FineSurface;
 pub use fpfh::{DESCRIPTOR_LEN, Descriptor, fpfh};
@@ -23,3 +24,4 @@ pub use resolution::{choose_resolution, extent, natural_resolution};
 pub use sensor::{SensorPosition, Stance, Surfaces, Viewpoint, viewpoint};
 pub use signature::{SIGNATURE_LEN, signature};
 pub use similarity::Columns;
+pub use surfel::Surfel;

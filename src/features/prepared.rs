@@ -15,6 +15,7 @@ use super::range_image::RangeImage;
 use super::resolution::extent;
 use super::sensor::{Stance, Surfaces, viewpoint};
 use super::signature::signature;
+use super::surfel::Surfel;
 use crate::cloud::{PointCloud, ScanKey, face, normals};
 use crate::control::{Cancelled, Control, Seed};
 use crate::geometry::{NearestGrid, NeighborIndex, Point, Pose, voxel_centroids};
@@ -162,6 +163,8 @@ impl PreparedScan {
 pub struct Scan {
     /// The data.
     pub prepared: PreparedScan,
+    /// Its points with their normals, in their order.
+    pub surfels: Vec<Surfel>,
     /// Nearest points by position.
     pub grid: NearestGrid,
     /// Mean of the points, metres, local frame.
@@ -181,8 +184,10 @@ impl Scan {
         let position = |p: &Point| Vector3::from(*p).cast::<f64>();
         let centroid = prepared.points.iter().map(position).sum::<Vector3<f64>>() / n;
         let square = prepared.points.iter().map(|p| (position(p) - centroid).norm_squared()).sum::<f64>() / n;
+        let surfels = Surfel::of_all(&prepared.points, &prepared.normals);
         Self {
             prepared,
+            surfels,
             grid,
             centroid,
             rms_radius: square.sqrt(),

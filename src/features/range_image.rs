@@ -6,14 +6,14 @@ use std::sync::Arc;
 use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::Point;
+use crate::geometry::{Point, whole};
 
 /// Pixels of the finest image are this wide at unit depth (tangent of the angle); coarser images come from distance.
 const PIXEL_RANGE: (f32, f32) = (0.002, 0.02);
 /// Half the width of a face, as a tangent: slightly over 45 degrees, so that a 3 x 3 window never leaves its face.
 const HALF_WIDTH: f32 = 1.04;
 /// Of the nine pixels around one, this many must have depths for it to be judged.
-const MIN_FILLED: usize = 5;
+const MIN_FILLED: f32 = 5.0;
 /// Depth tolerance: a part that follows the voxel size and a part that follows the pixel's footprint.
 const MARGIN_VOXELS: f32 = 2.0;
 const MARGIN_PIXELS: f32 = 1.5;
@@ -57,17 +57,28 @@ impl RangeImage {
     /// what it scans, so a large share says that it did not stand there.
     #[must_use]
     pub fn render(points: &[Point], sensor: Point, resolution: f32) -> (Self, f64) {
-        let mut depths: Vec<f32> =
-            points.iter().filter_map(|p| project(p, &sensor)).map(|(_, _, d)| d).collect();
+        let depth = |p: &Point| (0..3).map(|k| (p[k] - sensor[k]).abs()).fold(0.0, f32::max);
+        let mut depths: Vec<f32> = points.iter().map(depth).filter(|d| is_depth(*d)).collect();
         let middle = depths.len() / 2;
         let median =
             if depths.is_empty() { 1.0 } else { *depths.select_nth_unstable_by(middle, f32::total_cmp).1 };
         let pixel = (resolution / median).clamp(PIXEL_RANGE.0, PIXEL_RANGE.1);
         let width = (2.0 * HALF_WIDTH / pixel).ceil() as u32;
         let mut hits: Vec<Vec<(u32, u32, f32)>> = vec![Vec::new(); 6];
-        for (face, at, depth) in points.iter().filter_map(|p| project(p, &sensor)) {
-            let [column, row] = at.map(|t| (((t + HALF_WIDTH) / pixel) as u32).min(width - 1));
-            hits[face].push((column, row, depth));
+        let mut pixels = Pixels::default();
+        for points in points.chunks(Pixels::MOST) {
+            let mut axes = [[0.0; Pixels::MOST]; 3];
+            for (i, point) in points.iter().enumerate() {
+                for (axis, x) in axes.iter_mut().zip(point) {
+                    axis[i] = *x;
+                }
+            }
+            let [x, y, z] = axes.each_ref().map(|axis| &axis[..points.len()]);
+            find_pixels(x, y, z, &sensor, pixel, &mut pixels);
+            for i in (0..points.len()).filter(|i| pixels.depth[*i] > 0.0) {
+                let [column, row] = [pixels.column[i], pixels.row[i]].map(|at| at.min(width - 1));
+                hits[pixels.face[i] as usize % 6].push((column, row, pixels.depth[i]));
+            }
         }
         let margin = MARGIN_VOXELS * resolution;
         let (mut judged, mut hidden) = (0_usize, 0_usize);
@@ -178,12 +189,55 @@ fn find_pixels(x: &[f32], y: &[f32], z: &[f32], sensor: &Point, width: f32, pixe
             (dz, dx, dy, 4)
         };
         let depth = along.abs();
-        let valid = (depth > 1e-9) && (depth < f32::INFINITY);
+        let valid = is_depth(depth);
         faces[i] = axis + u32::from(along < 0.0);
-        columns[i] = ((u / depth + HALF_WIDTH) / width) as u32;
-        rows[i] = ((v / depth + HALF_WIDTH) / width) as u32;
+        columns[i] = whole((u / depth + HALF_WIDTH) / width);
+        rows[i] = whole((v / depth + HALF_WIDTH) / width);
         depths[i] = if valid { depth } else { 0.0 };
     }
+}
+
+/// What a row of three pixels or a window of three rows holds.
+#[derive(Clone, Copy)]
+struct Window {
+    least: f32,
+    greatest: f32,
+    /// Pixels with a depth.
+    filled: f32,
+}
+
+impl Window {
+    fn of_pixel(depth: f32) -> Self {
+        let is_filled = depth < f32::INFINITY;
+        Self {
+            least: depth,
+            greatest: if is_filled { depth } else { 0.0 },
+            filled: if is_filled { 1.0 } else { 0.0 },
+        }
+    }
+
+    fn of_three([a, b, c]: [Self; 3]) -> Self {
+        Self {
+            least: a.least.min(b.least).min(c.least),
+            greatest: a.greatest.max(b.greatest).max(c.greatest),
+            filled: a.filled + b.filled + c.filled,
+        }
+    }
+}
+
+/// The least and the greatest depth in the window of each pixel that is not in the margin, 0 where too few are filled. `nearest` has rows
+/// of `wide` pixels, infinite where nothing was seen.
+fn windows(nearest: &[f32], wide: usize) -> (Vec<f32>, Vec<f32>) {
+    let rows: Vec<Vec<Window>> = nearest
+        .chunks_exact(wide)
+        .map(|row| {
+            row.windows(3).map(|of| Window::of_three([of[0], of[1], of[2]].map(Window::of_pixel))).collect()
+        })
+        .collect();
+    rows.windows(3)
+        .flat_map(|of| (0..wide - 2).map(|x| Window::of_three([of[0][x], of[1][x], of[2][x]])))
+        .map(|window| if window.filled >= MIN_FILLED { (window.least, window.greatest) } else { (0.0, 0.0) })
+        .unzip()
 }
 
 impl Face {
@@ -198,34 +252,14 @@ impl Face {
         let (columns, rows) = (span(|h| h.0), span(|h| h.1));
         let (column, row) = (columns.0.saturating_sub(1), rows.0.saturating_sub(1));
         let (columns, rows) = ((columns.1 + 2).min(width) - column, (rows.1 + 2).min(width) - row);
-        let mut nearest = vec![f32::INFINITY; (columns * rows) as usize];
+        // With a margin of one pixel around.
+        let (wide, high) = (columns as usize + 2, rows as usize + 2);
+        let mut nearest = vec![f32::INFINITY; wide * high];
         for &(x, y, depth) in hits {
-            let pixel = &mut nearest[((y - row) * columns + (x - column)) as usize];
+            let pixel = &mut nearest[(y - row + 1) as usize * wide + (x - column + 1) as usize];
             *pixel = pixel.min(depth);
         }
-        let mut depths = vec![0.0; nearest.len()];
-        let mut farthest = vec![0.0; nearest.len()];
-        for y in 0..rows {
-            for x in 0..columns {
-                let mut least = f32::INFINITY;
-                let mut greatest = 0.0_f32;
-                let mut filled = 0;
-                for wy in y.saturating_sub(1)..(y + 2).min(rows) {
-                    for wx in x.saturating_sub(1)..(x + 2).min(columns) {
-                        let depth = nearest[(wy * columns + wx) as usize];
-                        if depth.is_finite() {
-                            filled += 1;
-                            least = least.min(depth);
-                            greatest = greatest.max(depth);
-                        }
-                    }
-                }
-                if filled >= MIN_FILLED {
-                    depths[(y * columns + x) as usize] = least;
-                    farthest[(y * columns + x) as usize] = greatest;
-                }
-            }
-        }
+        let (depths, farthest) = windows(&nearest, wide);
         (Self { column, row, columns, rows, depths }, farthest)
     }
 
@@ -242,6 +276,12 @@ impl Face {
     }
 }
 
+/// Whether a point at this distance along an axis can be seen, metres.
+#[inline]
+fn is_depth(depth: f32) -> bool {
+    (depth > 1e-9) && (depth < f32::INFINITY)
+}
+
 /// The face through which a point is seen, its two tangents there, and its depth along the face's axis.
 #[inline]
 fn project(point: &Point, sensor: &Point) -> Option<(usize, [f32; 2], f32)> {
@@ -255,7 +295,7 @@ fn project(point: &Point, sensor: &Point) -> Option<(usize, [f32; 2], f32)> {
         2
     };
     let depth = size[axis];
-    if !(depth > 1e-9 && depth.is_finite()) {
+    if !is_depth(depth) {
         return None;
     }
     let face = axis * 2 + usize::from(d[axis] < 0.0);

@@ -24,11 +24,14 @@ pub fn extent(points: &[Point]) -> f64 {
     let mut square = 0.0;
     for k in 0..3 {
         let mut axis: Vec<f32> = points.iter().map(|p| p[k]).collect();
-        let mut at = |share: f64| {
-            let index = ((axis.len() - 1) as f64 * share).round() as usize;
-            f64::from(*axis.select_nth_unstable_by(index, f32::total_cmp).1)
+        let at = |share: f64| ((axis.len() - 1) as f64 * share).round() as usize;
+        let (lower, upper) = (at(0.02), at(0.98));
+        let (_, low, above) = axis.select_nth_unstable_by(lower, f32::total_cmp);
+        let high = match (upper - lower).checked_sub(1) {
+            Some(next) => *above.select_nth_unstable_by(next, f32::total_cmp).1,
+            None => *low,
         };
-        square += (at(0.98) - at(0.02)).powi(2);
+        square += (f64::from(high) - f64::from(*low)).powi(2);
     }
     square.sqrt()
 }

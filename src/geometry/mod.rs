@@ -14,14 +14,16 @@ mod rigid_fit;
 mod robust;
 mod spread;
 mod voxel_grid;
+mod whole;
 
 pub use nearest_grid::NearestGrid;
-pub use neighbors::{Moments, NeighborIndex, Surroundings};
+pub use neighbors::{Moments, NeighborIndex, Pairs};
 pub use pose::{Pose, PoseError};
 pub use rigid_fit::rigid_fit;
 pub use robust::Kernel;
 pub use spread::Spread;
 pub use voxel_grid::{cell_of, occupied_voxels, voxel_centroids, voxel_groups};
+pub use whole::whole;
 
 /// A point or direction in single precision, local to its scan. Metres.
 pub type Point = [f32; 3];

@@ -6,6 +6,7 @@ use multiversion::multiversion;
 
 use super::Point;
 use super::voxel_grid::cell_of;
+use super::whole::whole;
 
 /// Cells along the edge of a brick, as a power of two.
 const BRICK_BITS: u32 = 3;
@@ -22,6 +23,8 @@ const CORNERS: usize = 8;
 /// Top-level bricks at most, so that a stray point far away cannot make the table huge (16 MiB of it), and that the number of a
 /// brick and that of a cell in it fit into one word.
 const MAX_BRICKS: usize = 1 << 22;
+/// Of these along one axis at most, so that numbers in single precision tell its cells apart.
+const MAX_ALONG: usize = 1 << 20;
 
 /// Constant-time lookup of a near point. Built once per scan.
 #[derive(Debug, Clone)]
@@ -239,7 +242,7 @@ fn place(frame: &Frame, x: f32, y: f32, z: f32) -> u32 {
     let (x, y, z) = (offset(0, x), offset(1, y), offset(2, z));
     let within = |k: usize, x: f32| (x >= 0.0) && (x < frame.cells[k]);
     let inside = within(0, x) && within(1, y) && within(2, z);
-    let cell = |x: f32| if inside { x as i32 as u32 } else { 0 };
+    let cell = |x: f32| if inside { whole(x) } else { 0 };
     let (x, y, z) = (cell(x), cell(y), cell(z));
     let [nx, ny, nz] = frame.bricks;
     let brick = ((x >> BRICK_BITS) * ny + (y >> BRICK_BITS)) * nz + (z >> BRICK_BITS);
@@ -260,27 +263,34 @@ fn places(frame: &Frame, x: &[f32], y: &[f32], z: &[f32], found: &mut [u32]) {
 
 /// Cells that the grid covers: all points with their reach, or as large a middle part as the table may have.
 fn bounds(cells: &[[i64; 3]]) -> Option<([i64; 3], [i64; 3])> {
-    let mut trim = 0;
-    loop {
-        let mut low = [0; 3];
-        let mut high = [0; 3];
+    let mut low = *cells.first()?;
+    let mut high = low;
+    for cell in cells {
         for k in 0..3 {
-            let mut axis: Vec<i64> = cells.iter().map(|c| c[k]).collect();
-            let upper = axis.len().checked_sub(1 + trim)?;
-            if upper < trim {
-                return None;
-            }
-            low[k] = axis.select_nth_unstable(trim).1.saturating_sub(REACH);
-            high[k] = axis.select_nth_unstable(upper).1.saturating_add(REACH);
+            low[k] = low[k].min(cell[k]);
+            high[k] = high[k].max(cell[k]);
         }
+    }
+    let mut trim = 1;
+    loop {
+        low = low.map(|cell| cell.saturating_sub(REACH));
+        high = high.map(|cell| cell.saturating_add(REACH));
         let fits = (0..3)
             .try_fold(1_usize, |product, k| {
                 let bricks = high[k].checked_sub(low[k])?.checked_div(BRICK)?.checked_add(1)?;
-                product.checked_mul(usize::try_from(bricks).ok()?)
+                let bricks = usize::try_from(bricks).ok().filter(|bricks| *bricks <= MAX_ALONG)?;
+                product.checked_mul(bricks)
             })
             .is_some_and(|bricks| bricks <= MAX_BRICKS);
         if fits {
             return Some((low, high));
+        }
+        // Without the outermost on every side.
+        for k in 0..3 {
+            let mut axis: Vec<i64> = cells.iter().map(|c| c[k]).collect();
+            let upper = axis.len().checked_sub(1 + trim).filter(|upper| *upper >= trim)?;
+            low[k] = *axis.select_nth_unstable(trim).1;
+            high[k] = *axis.select_nth_unstable(upper).1;
         }
         trim = trim * 2 + 1;
     }

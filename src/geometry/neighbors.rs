@@ -11,21 +11,25 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::Point;
-use super::voxel_grid::{cell_of, sorted_by_cell};
+use super::voxel_grid::{ByCell, cell_of};
 
 /// Points that are looked at together.
 const BLOCK: usize = 64;
-/// Points whose moments are summed side by side. A block is a multiple of it.
+/// Points that are copied, and whose moments are summed, side by side. A block is a multiple of it.
 const LANES: usize = 16;
+/// Cells whose queries one thread answers in a row.
+const TOGETHER: usize = 64;
 /// Nothing is near it.
 const NOWHERE: f32 = f32::INFINITY;
 
 /// The points of one scan, sorted for lookups.
 pub struct NeighborIndex {
     size: f32,
-    /// The occupied cells, ascending, and where the points of each begin.
-    cells: Vec<([i64; 3], usize)>,
-    /// The points, cell after cell.
+    /// The x and y of occupied cells, ascending, and where the cells of each begin.
+    columns: Vec<([i64; 2], usize)>,
+    /// The z of the occupied cells, and where the points of each begin.
+    cells: Vec<(i64, usize)>,
+    /// The points, cell after cell, and behind them [`LANES`] that are nowhere.
     position: [Vec<f32>; 3],
     /// Which point each is.
     item: Vec<u32>,
@@ -35,24 +39,41 @@ pub struct NeighborIndex {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Moments {
     /// How many there are.
-    pub count: usize,
+    pub count: u32,
     /// Sums of x, y, z.
-    pub sum: [f64; 3],
+    pub sum: [f32; 3],
     /// Sums of xx, xy, xz, yy, yz, zz.
-    pub products: [f64; 6],
+    pub products: [f32; 6],
 }
 
-/// The points around the queries of one cell.
-#[derive(Default)]
-pub struct Surroundings {
-    /// One array a coordinate, filled up with points that are nowhere.
-    position: [Vec<f32>; 3],
-    /// Which point each is, in the order of the index.
-    item: Vec<u32>,
-    /// Metres.
-    radius: f32,
-    /// Where the cells of each x began that were looked up last: those of the next query are near.
-    columns: Vec<usize>,
+/// Pairs of points of an index that are near each other, each of them once. Points go by their place in the order of the index.
+#[derive(Debug, Clone, Default)]
+pub struct Pairs {
+    /// For points that follow each other.
+    parts: Vec<Part>,
+}
+
+/// The pairs of some points.
+#[derive(Debug, Clone, Default)]
+struct Part {
+    /// Where the partners of each point end.
+    ends: Vec<usize>,
+    /// Places after that of the point, ascending, with squared distances in square metres.
+    partners: Vec<(u32, f32)>,
+}
+
+impl Pairs {
+    /// For each point in the order of the index, its partners that come after it, with squared distances in square metres.
+    pub fn by_point(&self) -> impl Iterator<Item = &[(u32, f32)]> {
+        self.parts.iter().flat_map(|part| {
+            let mut begin = 0;
+            part.ends.iter().map(move |end| {
+                let partners = begin..*end;
+                begin = partners.end;
+                &part.partners[partners]
+            })
+        })
+    }
 }
 
 impl NeighborIndex {
@@ -60,52 +81,101 @@ impl NeighborIndex {
     /// position in `points`.
     #[must_use]
     pub fn new(points: &[Point], reach: f32) -> Self {
-        let order = sorted_by_cell(points, reach);
-        let mut cells: Vec<([i64; 3], usize)> = Vec::new();
-        for (at, (cell, _)) in order.iter().enumerate() {
-            if cells.last().is_none_or(|(last, _)| last != cell) {
-                cells.push((*cell, at));
+        let sorted = ByCell::of(points, reach);
+        let mut columns: Vec<([i64; 2], usize)> = Vec::new();
+        let mut cells = Vec::new();
+        let mut begin = 0;
+        for group in sorted.groups() {
+            let [x, y, z] = cell_of(&points[group[0] as usize], reach);
+            if columns.last().is_none_or(|(last, _)| *last != [x, y]) {
+                columns.push(([x, y], cells.len()));
             }
+            cells.push((z, begin));
+            begin += group.len();
         }
-        let coordinate =
-            |k: usize| -> Vec<f32> { order.iter().map(|(_, item)| points[*item as usize][k]).collect() };
-        Self {
-            size: reach,
-            cells,
-            position: std::array::from_fn(coordinate),
-            item: order.iter().map(|(_, item)| *item).collect(),
-        }
+        let coordinate = |k: usize| -> Vec<f32> {
+            let mut axis = Vec::with_capacity(points.len() + LANES);
+            axis.extend(sorted.items.iter().map(|item| points[*item as usize][k]));
+            axis.resize(points.len() + LANES, NOWHERE);
+            axis
+        };
+        Self { size: reach, columns, cells, position: std::array::from_fn(coordinate), item: sorted.items }
+    }
+
+    /// Which point is at each place of the order that the index keeps points in: those of a cell side by side.
+    #[must_use]
+    pub fn order(&self) -> &[u32] {
+        &self.item
     }
 
     /// Calls `visit(index, squared distance in m^2)` for every point nearer than `radius` metres, in an order that depends
     /// only on the indexed points and the query. The time grows with the square of `radius` over the index's reach.
-    pub fn within(&self, point: &Point, radius: f32, visit: impl FnMut(usize, f32)) {
-        Surroundings::default().gather(self, [point], radius).within(point, visit);
+    pub fn within(&self, point: &Point, radius: f32, mut visit: impl FnMut(usize, f32)) {
+        let mut around = Surroundings::default();
+        around.gather(self, [point], radius);
+        let mut near = Vec::new();
+        around.add_near(0, point, &mut near);
+        for (place, square) in near {
+            visit(self.item[place as usize] as usize, square);
+        }
     }
 
-    /// What `answer(number of the query, points around it, spare)` says of each query, in their order. Faster than one lookup for each, as
-    /// those that lie near each other share one. `spare` is a thing of the caller's, to be used again from query to query: a buffer.
-    pub fn map<T: Send, S: Default>(
+    /// What `answer` says of the moments of the points nearer than `radius` metres to each of some places, given for many of them at a time. How
+    /// moments round depends on the other places.
+    pub fn map_moments<T: Copy + Default + Send>(
         &self,
-        queries: &[Point],
+        places: &[Point],
         radius: f32,
-        answer: impl Fn(usize, &Surroundings, &mut S) -> T + Sync,
+        answer: impl Fn(&[Moments]) -> Vec<T> + Sync,
     ) -> Vec<T> {
-        let order = sorted_by_cell(queries, self.size);
-        let groups: Vec<&[([i64; 3], u32)]> = order.chunk_by(|a, b| a.0 == b.0).collect();
+        let sorted = ByCell::of(places, self.size);
+        let groups: Vec<&[u32]> = sorted.groups().collect();
         let answered: Vec<Vec<T>> = groups
-            .par_iter()
-            .map_init(<(Surroundings, S)>::default, |(around, spare), group| {
-                around.gather(self, group.iter().map(|(_, query)| &queries[*query as usize]), radius);
-                group.iter().map(|(_, query)| answer(*query as usize, around, spare)).collect()
+            .par_chunks(TOGETHER)
+            .map_init(<(Surroundings, Vec<Moments>)>::default, |(around, moments), groups| {
+                moments.clear();
+                for group in groups {
+                    around.gather(self, group.iter().map(|place| &places[*place as usize]), radius);
+                    moments.extend(group.iter().map(|place| around.moments(&places[*place as usize])));
+                }
+                answer(moments)
             })
             .collect();
-        let mut answers: Vec<Option<T>> = queries.iter().map(|_| None).collect();
-        for ((_, query), answer) in order.iter().zip(answered.into_iter().flatten()) {
-            answers[*query as usize] = Some(answer);
+        let mut answers = vec![T::default(); places.len()];
+        for (place, answer) in sorted.items.iter().zip(answered.into_iter().flatten()) {
+            answers[*place as usize] = answer;
         }
-        // Each query is in one group.
-        answers.into_iter().flatten().collect()
+        answers
+    }
+
+    /// All pairs of points that are nearer to each other than `radius` metres.
+    #[must_use]
+    pub fn pairs(&self, radius: f32) -> Pairs {
+        let numbers: Vec<usize> = (0..self.cells.len()).collect();
+        let parts = numbers
+            .par_chunks(TOGETHER)
+            .map_init(Surroundings::default, |around, cells| {
+                let mut part = Part::default();
+                for cell in cells {
+                    self.pairs_from(*cell, radius, around, &mut part);
+                }
+                part
+            })
+            .collect();
+        Pairs { parts }
+    }
+
+    /// Adds the pairs whose first point is in a cell.
+    fn pairs_from(&self, cell: usize, radius: f32, around: &mut Surroundings, found: &mut Part) {
+        let own = self.begin(cell)..self.begin(cell + 1);
+        let points: Vec<Point> =
+            own.clone().map(|at| self.position.each_ref().map(|axis| axis[at])).collect();
+        around.gather_from(self, &points, radius, own.start);
+        for (at, point) in points.iter().enumerate() {
+            // What was gathered begins with the points of the cell.
+            around.add_near(at + 1, point, &mut found.partners);
+            found.ends.push(found.partners.len());
+        }
     }
 
     /// Where the points of a cell begin, or of the one after the last.
@@ -113,34 +183,70 @@ impl NeighborIndex {
         self.cells.get(cell).map_or(self.item.len(), |(_, begin)| *begin)
     }
 
-    /// The number of the first cell that is not before `cell`, sought from a guess: close to it in few steps.
-    fn first_cell(&self, cell: [i64; 3], guess: usize) -> usize {
-        let is_before = |at: usize| self.cells[at].0 < cell;
-        let guess = guess.min(self.cells.len());
-        let (mut low, mut high, mut step) = (guess, guess, 1);
-        // All before `low` come before the cell, none from `high` on does.
-        while low > 0 && !is_before(low - 1) {
-            high = low - 1;
-            low = low.saturating_sub(step);
-            step *= 2;
+    /// Where the cells of a column begin, or of the one after the last.
+    fn column(&self, column: usize) -> usize {
+        self.columns.get(column).map_or(self.cells.len(), |(_, begin)| *begin)
+    }
+}
+
+/// The points around the queries of one cell, in the order of the index.
+#[derive(Default)]
+struct Surroundings {
+    len: usize,
+    /// One array a coordinate, filled up to a multiple of [`LANES`] with points that are nowhere. There may be more behind that.
+    position: [Vec<f32>; 3],
+    /// The place of each point in the index.
+    place: Vec<u32>,
+    /// Metres.
+    radius: f32,
+    /// The least and the greatest x and y of the columns of cells that were looked up last: mostly the next query has the same.
+    span: [[i64; 2]; 2],
+    /// Those columns, as far as there is anything.
+    columns: Vec<Column>,
+}
+
+/// Cells that differ in z alone.
+struct Column {
+    cells: Range<usize>,
+    /// The first of them that was near when they were looked up last.
+    at: usize,
+}
+
+impl Column {
+    /// The cells from one z to another.
+    fn cells_between(&mut self, index: &NeighborIndex, low: i64, high: i64) -> Range<usize> {
+        let cells = &index.cells[self.cells.clone()];
+        let mut at = self.at - self.cells.start;
+        if at > 0 && cells[at - 1].0 >= low {
+            at = cells.partition_point(|(z, _)| *z < low);
         }
-        while high < self.cells.len() && is_before(high) {
-            low = high + 1;
-            high = (high + step).min(self.cells.len());
-            step *= 2;
-        }
-        low + self.cells[low..high].partition_point(|(other, _)| *other < cell)
+        // Queries come sorted, so that these are few steps.
+        at += cells[at..].iter().take_while(|(z, _)| *z < low).count();
+        let many = cells[at..].iter().take_while(|(z, _)| *z <= high).count();
+        self.at = self.cells.start + at;
+        self.at..self.at + many
     }
 }
 
 impl Surroundings {
     /// Becomes what lies within `radius` metres of any of some places, with the same buffers.
-    pub fn gather<'p>(
+    fn gather<'p>(
         &mut self,
         index: &NeighborIndex,
         places: impl IntoIterator<Item = &'p Point>,
         radius: f32,
-    ) -> &Self {
+    ) {
+        self.gather_from(index, places, radius, 0);
+    }
+
+    /// The same without the points before a place of the index.
+    fn gather_from<'p>(
+        &mut self,
+        index: &NeighborIndex,
+        places: impl IntoIterator<Item = &'p Point>,
+        radius: f32,
+        first: usize,
+    ) {
         let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
         for place in places {
             for k in 0..3 {
@@ -149,77 +255,112 @@ impl Surroundings {
             }
         }
         self.radius = radius;
-        self.item.clear();
-        self.position.iter_mut().for_each(Vec::clear);
-        let (low, high) = (cell_of(&low, index.size), cell_of(&high, index.size));
-        for (column, x) in (low[0]..=high[0]).enumerate() {
-            if column == self.columns.len() {
-                self.columns.push(0);
-            }
-            let mut at = self.columns[column];
-            for y in low[1]..=high[1] {
-                at = index.first_cell([x, y, low[2]], at);
-                if y == low[1] {
-                    self.columns[column] = at;
-                }
-                // Cells that differ in z alone follow each other.
-                let begin = at;
-                at += index.cells[at..].iter().take_while(|(cell, _)| *cell <= [x, y, high[2]]).count();
-                self.take(index, index.begin(begin)..index.begin(at));
+        self.len = 0;
+        let ([x, y, low], [far_x, far_y, high]) = (cell_of(&low, index.size), cell_of(&high, index.size));
+        self.look_up(index, [[x, y], [far_x, far_y]]);
+        let mut columns = std::mem::take(&mut self.columns);
+        for column in &mut columns {
+            let run = column.cells_between(index, low, high);
+            let run = index.begin(run.start).max(first)..index.begin(run.end);
+            if !run.is_empty() {
+                self.take(index, run);
             }
         }
-        let filled = self.item.len().next_multiple_of(LANES);
-        self.position.iter_mut().for_each(|axis| axis.resize(filled, NOWHERE));
-        self
+        self.columns = columns;
+        self.make_room(LANES);
+        for axis in &mut self.position {
+            axis[self.len..self.len + LANES].fill(NOWHERE);
+        }
+    }
+
+    /// Finds the columns of cells from one x and y to another.
+    fn look_up(&mut self, index: &NeighborIndex, span: [[i64; 2]; 2]) {
+        if self.span == span && !self.columns.is_empty() {
+            return;
+        }
+        self.span = span;
+        self.columns.clear();
+        let [[x, y], [far_x, far_y]] = span;
+        let next = |at: usize, from: [i64; 2]| {
+            at + index.columns[at..].partition_point(|(column, _)| *column < from)
+        };
+        let mut at = next(0, [x, y]);
+        while let Some(&([column_x, column_y], begin)) =
+            index.columns.get(at).filter(|(at, _)| at[0] <= far_x)
+        {
+            if column_y < y {
+                at = next(at, [column_x, y]);
+            } else if column_y <= far_y {
+                self.columns.push(Column { cells: begin..index.column(at + 1), at: begin });
+                at += 1;
+            } else if column_x < far_x {
+                at = next(at, [column_x + 1, y]);
+            } else {
+                break;
+            }
+        }
     }
 
     /// Adds a run of points.
     fn take(&mut self, index: &NeighborIndex, run: Range<usize>) {
-        self.item.extend_from_slice(&index.item[run.clone()]);
+        self.make_room(run.len());
         for (mine, all) in self.position.iter_mut().zip(&index.position) {
-            mine.extend_from_slice(&all[run.clone()]);
+            // A few too many are copied, at once: what follows is written over them.
+            let mine = mine[self.len..].as_chunks_mut::<LANES>().0;
+            let all = all[run.start..].as_chunks::<LANES>().0;
+            for (mine, all) in mine.iter_mut().zip(all).take(run.len().div_ceil(LANES)) {
+                *mine = *all;
+            }
+        }
+        for (mine, place) in self.place[self.len..].iter_mut().zip(run.start..run.end) {
+            *mine = place as u32;
+        }
+        self.len += run.len();
+    }
+
+    /// Makes the arrays reach this far behind the last point, and [`LANES`] more.
+    fn make_room(&mut self, more: usize) {
+        let needed = self.len + more + LANES;
+        if self.place.len() < needed {
+            let filled = 2 * needed;
+            self.position.iter_mut().for_each(|axis| axis.resize(filled, NOWHERE));
+            self.place.resize(filled, 0);
         }
     }
 
-    /// Calls `visit(index, squared distance in m^2)` for every point in the radius of one of the queries that these surroundings are of.
-    pub fn within(&self, point: &Point, mut visit: impl FnMut(usize, f32)) {
+    /// Adds the points in the radius of one of the queries that these surroundings are of, with squared distances in square metres, without the
+    /// first few that were gathered. They go by their places in the index.
+    fn add_near(&self, skipped: usize, point: &Point, found: &mut Vec<(u32, f32)>) {
         let limit = self.radius * self.radius;
         let mut square = [0.0_f32; BLOCK];
-        let mut near = [0_usize; BLOCK];
-        let [xs, ys, zs] = self.position.each_ref().map(|axis| axis.chunks(BLOCK));
-        for (block, ((x, y), z)) in xs.zip(ys).zip(zs).enumerate() {
+        for first in (skipped..self.len).step_by(BLOCK) {
+            let block = first..(first + BLOCK).min(self.len);
+            let [x, y, z] = self.position.each_ref().map(|axis| &axis[block.clone()]);
             squares(x, y, z, point, &mut square);
-            // Without a branch for each: the next place is written to, but only kept for what is near.
-            let mut len = 0;
-            for i in 0..x.len() {
-                near[len] = i;
-                len += usize::from(square[i] < limit);
+            // Without a branch for each: the next entry is written to, but only kept for what is near.
+            let mut len = found.len();
+            found.resize(len + block.len(), (0, 0.0));
+            for (place, square) in self.place[block].iter().zip(&square) {
+                found[len] = (*place, *square);
+                len += usize::from(*square < limit);
             }
-            for &i in &near[..len] {
-                visit(self.item[block * BLOCK + i] as usize, square[i]);
-            }
+            found.truncate(len);
         }
     }
 
-    /// The moments of the points in the radius of one of the queries that these surroundings are of. How they round depends on the other queries.
-    #[must_use]
-    pub fn moments(&self, point: &Point) -> Moments {
-        let mut lanes = [[0.0_f32; LANES]; 10];
-        let [xs, ys, zs] = self.position.each_ref().map(Vec::as_slice);
-        add_moments(xs, ys, zs, point, self.radius * self.radius, &mut lanes);
-        let total = |k: usize| lanes[k].iter().map(|x| f64::from(*x)).sum::<f64>();
-        Moments {
-            count: total(0) as usize,
-            sum: std::array::from_fn(|k| total(1 + k)),
-            products: std::array::from_fn(|k| total(4 + k)),
-        }
+    /// The moments of the points in the radius of one of the queries that these surroundings are of.
+    fn moments(&self, point: &Point) -> Moments {
+        let filled = self.len.next_multiple_of(LANES);
+        let [x, y, z] = self.position.each_ref().map(|axis| &axis[..filled]);
+        let [count, sum_x, sum_y, sum_z, products @ ..] = sums(x, y, z, point, self.radius * self.radius);
+        Moments { count: count as u32, sum: [sum_x, sum_y, sum_z], products }
     }
 }
 
-/// Adds the points whose squared distance is below `limit` to the count, the three sums and the six products, lane by lane.
+/// Of the points whose squared distance is below `limit`: the count, the three sums and the six products.
 #[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
-fn add_moments(x: &[f32], y: &[f32], z: &[f32], point: &Point, limit: f32, lanes: &mut [[f32; LANES]; 10]) {
-    let mut sums = *lanes;
+fn sums(x: &[f32], y: &[f32], z: &[f32], point: &Point, limit: f32) -> [f32; 10] {
+    let mut lanes = [[0.0_f32; LANES]; 10];
     let [x, y, z] = [x, y, z].map(|axis| axis.as_chunks::<LANES>().0);
     for ((x, y), z) in x.iter().zip(y).zip(z) {
         for k in 0..LANES {
@@ -227,12 +368,16 @@ fn add_moments(x: &[f32], y: &[f32], z: &[f32], point: &Point, limit: f32, lanes
             let near = dx * dx + dy * dy + dz * dz < limit;
             let [dx, dy, dz, one] = [dx, dy, dz, 1.0].map(|v| if near { v } else { 0.0 });
             let terms = [one, dx, dy, dz, dx * dx, dx * dy, dx * dz, dy * dy, dy * dz, dz * dz];
-            for (sum, term) in sums.iter_mut().zip(terms) {
+            for (sum, term) in lanes.iter_mut().zip(terms) {
                 sum[k] += term;
             }
         }
     }
-    *lanes = sums;
+    lanes.map(|lanes| {
+        let eight: [f32; 8] = std::array::from_fn(|k| lanes[k] + lanes[k + 8]);
+        let four: [f32; 4] = std::array::from_fn(|k| eight[k] + eight[k + 4]);
+        (four[0] + four[2]) + (four[1] + four[3])
+    })
 }
 
 /// Squared distances of points from one.
@@ -251,6 +396,10 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    fn square(a: &Point, b: &Point) -> f32 {
+        (0..3).map(|k| (a[k] - b[k]).powi(2)).sum()
+    }
+
     proptest! {
         #[test]
         fn every_point_in_the_radius_is_found(
@@ -261,47 +410,71 @@ mod tests {
             reach in 0.5..4.0f32,
         ) {
             let points: Vec<Point> = cells.iter().map(|c| c.map(|x| x as f32)).collect();
-            let square = |p: &Point| (0..3).map(|k| (p[k] - query[k]).powi(2)).sum::<f32>();
             let index = NeighborIndex::new(&points, reach);
             let mut found = Vec::new();
             index.within(&query, radius, |i, _| found.push(i));
-            let moments = Surroundings::default().gather(&index, [&query], radius).moments(&query);
-            prop_assert_eq!(moments.count, found.len());
+            let moments = index.map_moments(&[query], radius, <[_]>::to_vec)[0];
+            prop_assert_eq!(moments.count as usize, found.len());
             let offset = |i: usize, k: usize| f64::from(points[i][k]) - f64::from(query[k]);
             for (at, (k, l)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].into_iter().enumerate() {
                 let sum: f64 = found.iter().map(|i| offset(*i, k)).sum();
                 let product: f64 = found.iter().map(|i| offset(*i, k) * offset(*i, l)).sum();
-                prop_assert!((moments.sum[k] - sum).abs() < 1e-3);
-                prop_assert!((moments.products[at] - product).abs() < 2e-3, "{} of {product}", moments.products[at]);
+                prop_assert!((f64::from(moments.sum[k]) - sum).abs() < 1e-3);
+                prop_assert!((f64::from(moments.products[at]) - product).abs() < 2e-3, "{} of {product}", moments.products[at]);
             }
             found.sort_unstable();
-            let clear = |i: &usize| (square(&points[*i]).sqrt() - radius).abs() > 1e-4;
+            let clear = |i: &usize| (square(&points[*i], &query).sqrt() - radius).abs() > 1e-4;
             let expected: Vec<usize> =
-                (0..points.len()).filter(|&i| square(&points[i]) < radius * radius).filter(clear).collect();
+                (0..points.len()).filter(|&i| square(&points[i], &query) < radius * radius).filter(clear).collect();
             found.retain(clear);
+            prop_assert_eq!(found, expected);
+        }
+
+        #[test]
+        fn every_pair_is_found_once(
+            cells in prop::collection::vec(prop::array::uniform3(-3..3i32), 0..200),
+            radius in 0.1..4.0f32,
+            reach in 0.5..4.0f32,
+        ) {
+            let points: Vec<Point> = cells.iter().map(|c| c.map(|x| x as f32)).collect();
+            let index = NeighborIndex::new(&points, reach);
+            let pairs = index.pairs(radius);
+            prop_assert_eq!(pairs.by_point().count(), points.len());
+            let mut found = Vec::new();
+            for (place, partners) in (0_u32..).zip(pairs.by_point()) {
+                let me = index.order()[place as usize];
+                let mut last = place;
+                for (other, distance) in partners {
+                    prop_assert!(*other > last, "{other} follows {last}");
+                    last = *other;
+                    let other = index.order()[*other as usize];
+                    prop_assert_eq!(*distance, square(&points[me as usize], &points[other as usize]));
+                    found.push((me.min(other), me.max(other)));
+                }
+            }
+            found.sort_unstable();
+            let near = |a: u32, b: u32| {
+                let square = square(&points[a as usize], &points[b as usize]);
+                square < radius * radius
+            };
+            let n = points.len() as u32;
+            let expected: Vec<(u32, u32)> =
+                (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).filter(|(a, b)| near(*a, *b)).collect();
             prop_assert_eq!(found, expected);
         }
     }
 
     #[test]
-    fn queries_are_answered_together_as_one_by_one() {
+    fn places_are_answered_together_as_one_by_one() {
         let point =
             |i: usize| [(i * 37 % 101) as f32 * 0.1, (i * 53 % 97) as f32 * 0.1, (i * 71 % 13) as f32];
         let points: Vec<Point> = (0..600).map(point).collect();
-        let queries: Vec<Point> = (600..900).map(point).map(|p| p.map(|x| x - 0.3)).collect();
+        let places: Vec<Point> = (600..900).map(point).map(|p| p.map(|x| x - 0.3)).collect();
         let index = NeighborIndex::new(&points, 1.0);
-        let together = index.map(&queries, 1.2, |query, around, found: &mut Vec<(usize, u32)>| {
-            found.clear();
-            around.within(&queries[query], |i, square| found.push((i, square.to_bits())));
-            (query, around.moments(&queries[query]), found.clone())
-        });
-        assert_eq!(together.len(), queries.len());
-        let mut around = Surroundings::default();
-        for (query, (number, moments, found)) in together.into_iter().enumerate() {
-            let mut alone = Vec::new();
-            index.within(&queries[query], 1.2, |i, square| alone.push((i, square.to_bits())));
-            assert_eq!((number, found), (query, alone));
-            let single = around.gather(&index, [&queries[query]], 1.2).moments(&queries[query]);
+        let together = index.map_moments(&places, 1.2, <[_]>::to_vec);
+        assert_eq!(together.len(), places.len());
+        for (place, moments) in places.iter().zip(together) {
+            let single = index.map_moments(std::slice::from_ref(place), 1.2, <[_]>::to_vec)[0];
             assert_eq!(moments.count, single.count);
             let sums = moments.sum.iter().zip(&single.sum);
             for (x, y) in sums.chain(moments.products.iter().zip(&single.products)) {
@@ -312,6 +485,9 @@ mod tests {
 
     #[test]
     fn without_points_nothing_is_near() {
-        NeighborIndex::new(&[], 1.0).within(&[0.0; 3], 1.0, |i, _| panic!("point {i} does not exist"));
+        let nothing = NeighborIndex::new(&[], 1.0);
+        nothing.within(&[0.0; 3], 1.0, |i, _| panic!("point {i} does not exist"));
+        assert_eq!(nothing.pairs(1.0).by_point().count(), 0);
+        assert_eq!(nothing.map_moments(&[[0.0; 3]], 1.0, <[_]>::to_vec), [Moments::default()]);
     }
 }

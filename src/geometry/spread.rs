@@ -1,6 +1,7 @@
 //! How points spread around their mean: the principal components of a neighbourhood.
 
-use nalgebra::{Matrix3, Vector3};
+use multiversion::multiversion;
+use nalgebra::Vector3;
 
 use super::Moments;
 
@@ -13,48 +14,131 @@ pub struct Spread {
     pub least: Vector3<f64>,
 }
 
+/// Matrices whose components are found side by side.
+const LANES: usize = 8;
+
+/// One number of each of them.
+type Numbers = [f64; LANES];
+
+/// cos(2/3 arccos((x + 1) / 2)) on [-1, 1] to within 2e-12: the polynomial through its values at thirteen Chebyshev nodes, from the constant up.
+const THIRD: [f64; 13] = [
+    0.766_044_443_118_978,
+    0.247_409_066_305_97,
+    -0.015_509_188_431_430_5,
+    0.002_466_353_286_295_8,
+    -0.000_504_124_832_036_538,
+    0.000_116_421_713_441_271,
+    -2.891_881_870_956_61e-5,
+    7.553_708_960_314_52e-6,
+    -2.039_643_266_108_75e-6,
+    5.436_753_739_726_65e-7,
+    -1.534_265_249_937_76e-7,
+    6.130_853_112_831_37e-8,
+    -1.796_658_291_376_63e-8,
+];
+
 impl Spread {
-    /// Of at least one point, in closed form: eigenvalues of a symmetric matrix by the angle that its determinant gives, and the
+    /// Of neighbourhoods of at least one point each, in closed form: eigenvalues of a symmetric matrix by the angle that its determinant gives, and the
     /// vector across the two rows of its remainder that span most (D. Eberly, "A Robust Eigensolver for 3 x 3 Symmetric Matrices", 2014).
     #[must_use]
-    pub fn of(near: &Moments) -> Self {
-        let n = near.count as f64;
-        let entry =
-            |at: usize, i: usize, j: usize| near.products[at] / n - near.sum[i] / n * (near.sum[j] / n);
-        let (xy, xz, yz) = (entry(1, 0, 1), entry(2, 0, 2), entry(4, 1, 2));
-        #[rustfmt::skip]
-        let covariance = Matrix3::new(
-            entry(0, 0, 0), xy, xz,
-            xy, entry(3, 1, 1), yz,
-            xz, yz, entry(5, 2, 2),
-        );
-        Self::of_covariance(&covariance)
-    }
-
-    fn of_covariance(covariance: &Matrix3<f64>) -> Self {
-        let mean = covariance.trace() / 3.0;
-        let centred = covariance - Matrix3::identity() * mean;
-        let scale = (centred.norm_squared() / 6.0).sqrt();
-        if scale <= f64::EPSILON * mean.abs() {
-            return Self { values: [mean; 3], least: Vector3::z() };
+    pub fn of_all(neighborhoods: &[Moments]) -> Vec<Self> {
+        let mut found = Vec::with_capacity(neighborhoods.len());
+        for some in neighborhoods.chunks(LANES) {
+            let mut covariances = [[0.0; LANES]; 6];
+            for (lane, near) in some.iter().enumerate() {
+                let n = f64::from(near.count);
+                let mean = near.sum.map(|sum| f64::from(sum) / n);
+                for (at, (i, j)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].into_iter().enumerate() {
+                    covariances[at][lane] = f64::from(near.products[at]) / n - mean[i] * mean[j];
+                }
+            }
+            let components = components(&covariances);
+            found.extend((0..some.len()).map(|lane| Self {
+                values: components.values.map(|value| value[lane]),
+                least: components.least.map(|axis| axis[lane]).into(),
+            }));
         }
-        let half = ((centred / scale).determinant() / 2.0).clamp(-1.0, 1.0);
-        let angle = half.acos() / 3.0;
-        let largest = mean + 2.0 * scale * angle.cos();
-        let smallest = mean + 2.0 * scale * (angle + std::f64::consts::TAU / 3.0).cos();
-        let rest = covariance - Matrix3::identity() * smallest;
-        let (x, y, z) = (rest.column(0), rest.column(1), rest.column(2));
-        let across = [x.cross(&y), y.cross(&z), z.cross(&x)];
-        let longest = across.iter().max_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()));
-        let least = longest.and_then(|a| a.try_normalize(0.0)).unwrap_or_else(Vector3::z);
-        Self { values: [smallest, 3.0 * mean - smallest - largest, largest], least }
+        found
     }
+}
+
+/// What [`Spread`] holds, of many.
+struct Components {
+    values: [Numbers; 3],
+    least: [Numbers; 3],
+}
+
+/// The components of symmetric matrices, given by their entries xx, xy, xz, yy, yz, zz.
+#[multiversion(targets("x86_64+avx512f+avx512dq", "x86_64+avx2", "aarch64+neon"))]
+fn components([xx, xy, xz, yy, yz, zz]: &[Numbers; 6]) -> Components {
+    const NONE: [Numbers; 3] = [[0.0; LANES]; 3];
+    let mut found = Components { values: NONE, least: NONE };
+    let Components { values: [smallest, middle, largest], least: [x, y, z] } = &mut found;
+    for k in 0..LANES {
+        let (a, b, c) = (xy[k], xz[k], yz[k]);
+        let mean = (xx[k] + yy[k] + zz[k]) / 3.0;
+        let (p, q, r) = (xx[k] - mean, yy[k] - mean, zz[k] - mean);
+        let off_diagonal = a * a + b * b + c * c;
+        let scale = ((p * p + q * q + r * r + 2.0 * off_diagonal) / 6.0).sqrt();
+        let spreads_alike = scale <= f64::EPSILON * mean.abs();
+        let inverse = if spreads_alike { 0.0 } else { 1.0 / scale };
+        let (p, q, r) = (p * inverse, q * inverse, r * inverse);
+        let (u, v, w) = (a * inverse, b * inverse, c * inverse);
+        let determinant = p * (q * r - w * w) - u * (u * r - w * v) + v * (u * w - q * v);
+        let half = (determinant * 0.5).clamp(-1.0, 1.0);
+        largest[k] = mean + 2.0 * scale * cosine_of_third(half);
+        smallest[k] = mean - 2.0 * scale * cosine_of_third(-half);
+        middle[k] = 3.0 * mean - smallest[k] - largest[k];
+
+        let (p, q, r) = (xx[k] - smallest[k], yy[k] - smallest[k], zz[k] - smallest[k]);
+        let across = [
+            [a * c - b * q, b * a - p * c, p * q - a * a],
+            [q * r - c * c, c * b - a * r, a * c - q * b],
+            [c * b - r * a, r * p - b * b, b * a - c * p],
+        ];
+        let square = |[x, y, z]: [f64; 3]| x * x + y * y + z * z;
+        let squares = across.map(square);
+        let second = squares[1] > squares[0];
+        let (best, most) = if second { (across[1], squares[1]) } else { (across[0], squares[0]) };
+        let third = squares[2] > most;
+        let (best, most) = if third { (across[2], squares[2]) } else { (best, most) };
+        let length = most.sqrt();
+        let determined = !spreads_alike && length > 0.0;
+        let inverse = if determined { 1.0 / length } else { 0.0 };
+        x[k] = best[0] * inverse;
+        y[k] = best[1] * inverse;
+        z[k] = if determined { best[2] * inverse } else { 1.0 };
+    }
+    found
+}
+
+/// cos(arccos(x) / 3), by the cosine of the half of that angle, of which it is a function without a corner.
+#[inline]
+fn cosine_of_third(x: f64) -> f64 {
+    let at = 2.0 * ((1.0 + x) * 0.5).sqrt() - 1.0;
+    THIRD.iter().rev().fold(0.0, |value, coefficient| value * at + coefficient)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Matrix3;
     use proptest::prelude::*;
+
+    /// The spread of a neighbourhood with a covariance matrix, found beside those of others.
+    fn of_covariance(matrix: &Matrix3<f64>) -> Spread {
+        let near = |matrix: &Matrix3<f64>| Moments {
+            count: 1,
+            sum: [0.0; 3],
+            products: [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].map(|at| matrix[at] as f32),
+        };
+        let mut all = vec![near(&Matrix3::from_diagonal(&Vector3::new(3.0, 2.0, 1.0))); LANES + 3];
+        all[LANES + 1] = near(matrix);
+        let found = Spread::of_all(&all);
+        assert_eq!(found.len(), all.len());
+        assert!((found[LANES + 2].least.z.abs() - 1.0).abs() < 1e-12, "{:?}", found[LANES + 2]);
+        found[LANES + 1]
+    }
 
     proptest! {
         #[test]
@@ -71,7 +155,7 @@ mod tests {
             }
             let rotation = nalgebra::Rotation3::new(Vector3::from(axis));
             let matrix = rotation.matrix() * Matrix3::from_diagonal(&Vector3::from(values)) * rotation.matrix().transpose();
-            let found = Spread::of_covariance(&matrix);
+            let found = of_covariance(&matrix);
             values.sort_by(f64::total_cmp);
             for (found, expected) in found.values.iter().zip(values) {
                 prop_assert!((found - expected).abs() <= 1e-7 * values[2], "{found} of {expected}");
@@ -86,13 +170,25 @@ mod tests {
     }
 
     #[test]
+    fn a_third_of_an_angle_is_a_third() {
+        for i in 0..=1000 {
+            let angle = std::f64::consts::PI * f64::from(i) / 1000.0;
+            let found = cosine_of_third(angle.cos());
+            assert!((found - (angle / 3.0).cos()).abs() < 1e-8, "{angle}: {found}");
+            if angle < 3.1 {
+                assert!((found - (angle / 3.0).cos()).abs() < 1e-11, "{angle}: {found}");
+            }
+        }
+    }
+
+    #[test]
     fn what_spreads_alike_has_some_direction() {
         for matrix in [Matrix3::zeros(), Matrix3::identity() * 4.0] {
-            let found = Spread::of_covariance(&matrix);
+            let found = of_covariance(&matrix);
             assert!((found.least.norm() - 1.0).abs() < 1e-9);
             assert_eq!(found.values, [matrix[(0, 0)]; 3]);
         }
-        let line = Spread::of_covariance(&Matrix3::from_diagonal(&Vector3::new(1.0, 0.0, 0.0)));
+        let line = of_covariance(&Matrix3::from_diagonal(&Vector3::new(1.0, 0.0, 0.0)));
         assert!((line.least.norm() - 1.0).abs() < 1e-9 && line.least.x.abs() < 1e-6, "{line:?}");
     }
 }

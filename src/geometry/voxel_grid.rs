@@ -17,19 +17,17 @@ pub fn cell_of(point: &Point, size: f32) -> [i64; 3] {
 /// ascending order. The result does not depend on the order of `points` beyond the indices themselves.
 #[must_use]
 pub fn voxel_groups(points: &[Point], size: f32) -> Vec<Vec<u32>> {
-    let order = sorted_by_cell(points, size);
-    order.chunk_by(|a, b| a.0 == b.0).map(|group| group.iter().map(|&(_, index)| index).collect()).collect()
+    ByCell::of(points, size).groups().map(<[u32]>::to_vec).collect()
 }
 
 /// The centroid of each occupied voxel, in lexicographic order of the cells. Metres.
 #[must_use]
 pub fn voxel_centroids(points: &[Point], size: f32) -> Vec<Point> {
-    let order = sorted_by_cell(points, size);
-    order
-        .chunk_by(|a, b| a.0 == b.0)
+    ByCell::of(points, size)
+        .groups()
         .map(|group| {
             let mut sum = [0.0_f64; 3];
-            for &(_, index) in group {
+            for &index in group {
                 for (total, x) in sum.iter_mut().zip(points[index as usize]) {
                     *total += f64::from(x);
                 }
@@ -42,54 +40,100 @@ pub fn voxel_centroids(points: &[Point], size: f32) -> Vec<Point> {
 /// Number of occupied voxels.
 #[must_use]
 pub fn occupied_voxels(points: &[Point], size: f32) -> usize {
-    sorted_by_cell(points, size).chunk_by(|a, b| a.0 == b.0).count()
+    ByCell::of(points, size).groups().len()
 }
 
-/// The points (by number) with their cells, sorted by both.
-pub(super) fn sorted_by_cell(points: &[Point], size: f32) -> Vec<([i64; 3], u32)> {
-    let cells: Vec<[i64; 3]> = points.iter().map(|point| cell_of(point, size)).collect();
-    if let Some(numbers) = sorted_by_key(&cells) {
-        return numbers.into_iter().map(|number| (cells[number as usize], number)).collect();
+/// Points sorted by their cells, these in lexicographic order, and by number within a cell.
+pub(super) struct ByCell {
+    /// The points, by number.
+    pub items: Vec<u32>,
+    /// Where the points of each cell end.
+    ends: Vec<u32>,
+}
+
+impl ByCell {
+    /// Sorts points into cells of `size` metres.
+    pub fn of(points: &[Point], size: f32) -> Self {
+        let cells: Vec<[i64; 3]> = points.iter().map(|point| cell_of(point, size)).collect();
+        match Axes::of(&cells) {
+            // One number for each cell sorts without comparing.
+            Some(axes) if axes.bits() <= u32::BITS => Self::radix(&cells, |cell| axes.number(cell) as u32),
+            Some(axes) if axes.bits() <= u64::BITS => Self::radix(&cells, |cell| axes.number(cell)),
+            _ => {
+                let mut items: Vec<u32> = (0..).take(cells.len()).collect();
+                items.sort_by_key(|item| cells[*item as usize]);
+                let ends = ends(items.iter().map(|item| cells[*item as usize]));
+                Self { items, ends }
+            }
+        }
     }
-    let mut order: Vec<_> = cells.into_iter().zip(0..).collect();
-    order.sort_unstable();
-    order
+
+    fn radix<K: Copy + PartialEq + radsort::Key>(
+        cells: &[[i64; 3]],
+        number: impl Fn(&[i64; 3]) -> K,
+    ) -> Self {
+        let mut keys: Vec<(K, u32)> = cells.iter().map(number).zip(0..).collect();
+        radsort::sort_by_key(&mut keys, |(key, _)| *key);
+        let ends = ends(keys.iter().map(|(key, _)| *key));
+        Self { items: keys.into_iter().map(|(_, item)| item).collect(), ends }
+    }
+
+    /// The points of each cell that has any.
+    pub fn groups(&self) -> impl ExactSizeIterator<Item = &[u32]> {
+        let mut begin = 0;
+        self.ends.iter().map(move |end| {
+            let group = begin..*end as usize;
+            begin = group.end;
+            &self.items[group]
+        })
+    }
 }
 
-/// The numbers of the points sorted by cell and number, by one key each that holds both and compares without a branch. `None` if the points
-/// spread over too many cells for that.
-fn sorted_by_key(cells: &[[i64; 3]]) -> Option<Vec<u32>> {
-    let mut low = *cells.first()?;
-    let mut high = low;
-    for cell in cells {
+/// Where each run of equal things ends.
+fn ends<T: PartialEq>(sorted: impl Iterator<Item = T>) -> Vec<u32> {
+    let mut ends = Vec::new();
+    let mut last = None;
+    for (at, one) in (1..).zip(sorted) {
+        match ends.last_mut() {
+            Some(end) if last.as_ref() == Some(&one) => *end = at,
+            _ => ends.push(at),
+        }
+        last = Some(one);
+    }
+    ends
+}
+
+/// How far cells reach along each axis, so that one number can stand for each of them, in their order.
+struct Axes {
+    low: [i64; 3],
+    bits: [u32; 3],
+}
+
+impl Axes {
+    /// Of cells, of which there must be some; `None` if they lie so far apart that the distance is no number.
+    fn of(cells: &[[i64; 3]]) -> Option<Self> {
+        let mut low = *cells.first()?;
+        let mut high = low;
+        for cell in cells {
+            for k in 0..3 {
+                low[k] = low[k].min(cell[k]);
+                high[k] = high[k].max(cell[k]);
+            }
+        }
+        let mut bits = [0; 3];
         for k in 0..3 {
-            low[k] = low[k].min(cell[k]);
-            high[k] = high[k].max(cell[k]);
+            bits[k] = u64::BITS - (high[k].checked_sub(low[k])? as u64).leading_zeros();
         }
+        Some(Self { low, bits })
     }
-    let bits = |most: u64| u64::BITS - most.leading_zeros();
-    let number_bits = bits(cells.len() as u64);
-    let mut axis_bits = [0; 3];
-    for k in 0..3 {
-        axis_bits[k] = bits(high[k].checked_sub(low[k])? as u64);
+
+    fn bits(&self) -> u32 {
+        self.bits.iter().sum()
     }
-    let key = |cell: &[i64; 3], number: u32| {
-        let axes = (0..3).fold(0, |key: u128, k| (key << axis_bits[k]) | (cell[k] - low[k]) as u128);
-        (axes << number_bits) | u128::from(number)
-    };
-    let keyed = cells.iter().zip(0_u32..);
-    match axis_bits.iter().sum::<u32>() + number_bits {
-        ..=64 => {
-            let mut keys: Vec<u64> = keyed.map(|(cell, number)| key(cell, number) as u64).collect();
-            keys.sort_unstable();
-            Some(keys.into_iter().map(|key| (key & ((1 << number_bits) - 1)) as u32).collect())
-        }
-        65..=128 => {
-            let mut keys: Vec<u128> = keyed.map(|(cell, number)| key(cell, number)).collect();
-            keys.sort_unstable();
-            Some(keys.into_iter().map(|key| (key & ((1 << number_bits) - 1)) as u32).collect())
-        }
-        _ => None,
+
+    /// The number of a cell, of as many bits as all axes together, which must be 64 at most.
+    fn number(&self, cell: &[i64; 3]) -> u64 {
+        (0..3).fold(0, |number, k| (number << self.bits[k]) | (cell[k] - self.low[k]) as u64)
     }
 }
 

@@ -6,7 +6,7 @@
 use multiversion::multiversion;
 
 use crate::features::Scan;
-use crate::geometry::{Point, Pose};
+use crate::geometry::Pose;
 
 /// Points of a block. Its arrays stay in the first-level cache.
 pub(crate) const BLOCK: usize = 256;
@@ -92,15 +92,13 @@ impl Contacts {
         first: usize,
         stride: usize,
     ) -> Option<usize> {
-        let (from, onto) = (&other.prepared, &scan.prepared);
-        let last = onto.points.len().checked_sub(1)?;
-        let points = from.points.get(first..)?.iter().step_by(stride);
-        let normals = from.normals.get(first..)?.iter().step_by(stride);
+        let last = scan.surfels.len().checked_sub(1)?;
+        let surfels = other.surfels.get(first..)?.iter().step_by(stride);
         self.len = 0;
-        for (i, (point, normal)) in points.zip(normals).take(BLOCK).enumerate() {
+        for (i, surfel) in surfels.take(BLOCK).enumerate() {
             for k in 0..3 {
-                self.point[k][i] = point[k];
-                self.normal[k][i] = normal[k];
+                self.point[k][i] = surfel.position[k];
+                self.normal[k][i] = surfel.normal[k];
             }
             self.len = i + 1;
         }
@@ -112,11 +110,10 @@ impl Contacts {
         let [x, y, z] = &self.point;
         scan.grid.nearest_of_all([&x[..used], &y[..used], &z[..used]], &mut self.found[..used]);
         for (i, found) in self.found[..used].iter_mut().enumerate() {
-            let near = (*found as usize).min(last);
-            let (target, normal): (&Point, &Point) = (&onto.points[near], &onto.normals[near]);
+            let near = &scan.surfels[(*found as usize).min(last)];
             for k in 0..3 {
-                self.offset[k][i] = target[k];
-                self.surface[k][i] = normal[k];
+                self.offset[k][i] = near.position[k];
+                self.surface[k][i] = near.normal[k];
             }
         }
         self.found[used..lanes].fill(u32::MAX);

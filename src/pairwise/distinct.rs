@@ -47,7 +47,7 @@ impl Coinciding {
 
 /// A point of both scans and its normal, metres, frame of a.
 #[derive(Clone, Copy)]
-struct Surfel {
+struct SharedPoint {
     point: Vector3<f32>,
     normal: Vector3<f32>,
 }
@@ -68,7 +68,7 @@ pub fn coinciding(a: &Scan, b: &Scan, a_from_b: &Pose) -> Coinciding {
 }
 
 /// The points of a that points of b coincide with, one for each of these.
-fn shared(a: &Scan, b: &Scan, a_from_b: &Pose, reach: f32) -> Vec<Surfel> {
+fn shared(a: &Scan, b: &Scan, a_from_b: &Pose, reach: f32) -> Vec<SharedPoint> {
     let (of_a, of_b) = (&a.prepared, &b.prepared);
     let turn = a_from_b.rotation.cast::<f32>();
     let carried = of_b.points.iter().zip(&of_b.normals);
@@ -76,7 +76,7 @@ fn shared(a: &Scan, b: &Scan, a_from_b: &Pose, reach: f32) -> Vec<Surfel> {
         .filter_map(|(point, normal)| {
             let point = a_from_b.transform_point(*point);
             let at = a.grid.nearest(&point)?;
-            let met = Surfel { point: of_a.points[at].into(), normal: of_a.normals[at].into() };
+            let met = SharedPoint { point: of_a.points[at].into(), normal: of_a.normals[at].into() };
             let is_near = (met.point - Vector3::from(point)).norm_squared() < reach * reach;
             (is_near && met.normal.dot(&(turn * Vector3::from(*normal))) > SAME_SURFACE).then_some(met)
         })
@@ -85,19 +85,19 @@ fn shared(a: &Scan, b: &Scan, a_from_b: &Pose, reach: f32) -> Vec<Surfel> {
 
 /// A plane of some thickness, seen from one side.
 struct Plane {
-    at: Surfel,
+    at: SharedPoint,
     /// Metres to either side.
     thickness: f32,
 }
 
 impl Plane {
-    fn holds(&self, surfel: &Surfel) -> bool {
-        let Surfel { point, normal } = &self.at;
+    fn holds(&self, surfel: &SharedPoint) -> bool {
+        let SharedPoint { point, normal } = &self.at;
         normal.dot(&surfel.normal) > SAME_PLANE && normal.dot(&(surfel.point - point)).abs() < self.thickness
     }
 
     /// The same through the middle of its points, across the mean of their normals.
-    fn settled(&self, surfels: &[Surfel]) -> Self {
+    fn settled(&self, surfels: &[SharedPoint]) -> Self {
         let (mut point, mut normal, mut count) = (Vector3::zeros(), Vector3::zeros(), 0.0_f32);
         for surfel in surfels.iter().filter(|surfel| self.holds(surfel)) {
             point += surfel.point;
@@ -105,7 +105,7 @@ impl Plane {
             count += 1.0;
         }
         let at = match normal.try_normalize(f32::MIN_POSITIVE) {
-            Some(normal) => Surfel { point: point / count, normal },
+            Some(normal) => SharedPoint { point: point / count, normal },
             None => self.at,
         };
         Self { at, ..*self }
@@ -113,7 +113,7 @@ impl Plane {
 }
 
 /// The plane that holds most points.
-fn largest_plane(surfels: &[Surfel], thickness: f32) -> Option<Plane> {
+fn largest_plane(surfels: &[SharedPoint], thickness: f32) -> Option<Plane> {
     let step = surfels.len().div_ceil(TRIED).max(1);
     let count = |plane: &Plane| surfels.iter().filter(|surfel| plane.holds(surfel)).count();
     let tried = surfels.iter().step_by(step).map(|at| Plane { at: *at, thickness });

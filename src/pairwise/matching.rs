@@ -145,8 +145,20 @@ fn top_two(line: &[f32]) -> (f32, f32) {
             best[k] = if x > best[k] { x } else { best[k] };
         }
     }
-    let mut top = (NOTHING, NOTHING);
-    for &x in best.iter().chain(&second).chain(chunks.remainder()) {
+    // Halves onto each other, until one is left.
+    let mut width = LANES;
+    while width > 1 {
+        width /= 2;
+        for k in 0..width {
+            let (x, y) = (best[k], best[k + width]);
+            let (lower, upper) = if x < y { (x, y) } else { (y, x) };
+            let next = if second[k] > second[k + width] { second[k] } else { second[k + width] };
+            best[k] = upper;
+            second[k] = if lower > next { lower } else { next };
+        }
+    }
+    let mut top = (best[0], second[0]);
+    for &x in chunks.remainder() {
         if x > top.0 {
             top = (x, top.0);
         } else if x > top.1 {
