@@ -78,16 +78,18 @@ fn preparing(c: &mut Criterion) {
     c.bench_function("prepare", |b| b.iter(|| ready(black_box(&f.clouds[0]), ScanKey(0), &f.options)));
 }
 
-/// Bound by the sort by cell, of keys of 64 bits that hold a point's cell and number; what is left is turning points into cells and summing them. Bytes do not matter; the 20,000 points are in the second-level cache.
+/// Half of it turns points into cells, three divisions for each, and sums them; the rest is bound by the stores of a radix sort by cell, three passes over
+/// keys of 32 bits. The 20,000 points are in the second-level cache. A sort that compares took twice as long for all of it.
 fn voxel_grid(c: &mut Criterion) {
     let f = &*FIXTURE;
     let size = f.options.resolution as f32 / 2.0;
     c.bench_function("voxel_centroids", |b| b.iter(|| voxel_centroids(black_box(&f.clouds[0].points), size)));
 }
 
-/// Bound by arithmetic: the distances of about three times as many points as lie in the radius and sums of products over those that do, sixteen
-/// points at once; then an arccosine and two cosines for the closed form of each normal. With a kd-tree, which branches for every few points, lookups were
-/// two fifths of preparing a scan; where each point looked its cells up by itself and its eigenvectors were found in steps, normals were a quarter.
+/// Half of it finds and copies what is around the queries of a cell, in nine runs of points; a third is arithmetic: the distances of about three times as
+/// many points as lie in the radius and sums of products over those that do, sixteen points at once; a tenth the closed form of eight normals at once. With an
+/// arccosine and two cosines for each normal, and cells sought anew for each query, it took twice as long. A kd-tree branches for every few
+/// points: with one, lookups were two fifths of preparing a scan.
 fn surface_normals(c: &mut Criterion) {
     let f = &*FIXTURE;
     let voxel = f.options.resolution as f32;
@@ -97,9 +99,10 @@ fn surface_normals(c: &mut Criterion) {
     c.bench_function("normals", |b| b.iter(|| normals(black_box(&coarse), &index, 2.0 * voxel)));
 }
 
-/// Bound by arithmetic: about 100 neighbours a point, each found by its distance, each pair of them with three angles, and each adding a
-/// histogram of 33 numbers, which comes from the second-level cache. With one arctangent at a time through libm the angles alone took twice as
-/// long as all of this.
+/// About 100 neighbours a point, each pair looked at once, in four parts of like size: finding it; its three angles, which are bound by the divisions and
+/// roots of sixteen pairs at once; counting them, by stores; and adding the histogram of each of the two to the other's sum, by the second-level cache.
+/// Where angles became numbers of bins through the language's conversion, which takes one at a time, they took twice as long; with one arctangent at
+/// a time through libm, longer than all of this.
 fn descriptors(c: &mut Criterion) {
     let f = &*FIXTURE;
     let scan = &f.scans[0].prepared;
@@ -107,8 +110,8 @@ fn descriptors(c: &mut Criterion) {
     c.bench_function("fpfh", |b| b.iter(|| fpfh(black_box(&scan.points), &scan.normals, radius)));
 }
 
-/// Bound by the throughput of multiply-add: 512 waves times all points times 33 numbers, and a cosine for each product, as a polynomial.
-/// Calling libm's cosine made it ten times as long.
+/// Bound by the throughput of fused multiply-add: 512 waves times all points times 33 numbers, as one product of matrices; a quarter is the cosine of
+/// each, as a polynomial. Calling libm's cosine made it ten times as long; sums for one vector of points at a time, which wait for each other, twice.
 fn signatures(c: &mut Criterion) {
     let f = &*FIXTURE;
     let scan = &f.scans[0].prepared;
@@ -145,7 +148,7 @@ fn second_order_consensus(c: &mut Criterion) {
 }
 
 /// Bound by the latency of the second-level cache: a point of the other scan costs two loads that follow each other (brick, cell), then one of a
-/// point and one of a normal, in places that the pose decides. They wait for each other across points as little as the
+/// point with its normal, in places that the pose decides. They wait for each other across points as little as the
 /// core allows, since nothing between them branches; with the branches it took more than twice as long. In a wrong pose points
 /// also go to the range image, another load each.
 fn verification(c: &mut Criterion) {

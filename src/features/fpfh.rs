@@ -21,7 +21,8 @@ const ROW: usize = DESCRIPTOR_LEN.next_multiple_of(16);
 const SUMMANDS: usize = 4;
 
 /// The descriptors of all points, from neighbours within `radius` metres. `normals` are unit vectors that face the sensor,
-/// one a point. A point without neighbours gets the zero descriptor, which matches nothing.
+/// one a point. A point without neighbours gets the zero descriptor, which matches nothing. All but the search for neighbours runs on one
+/// thread, as each pair adds to the sums of both its points; scans are prepared side by side.
 #[must_use]
 pub fn fpfh(points: &[Point], normals: &[Point], radius: f32) -> Vec<Descriptor> {
     let index = NeighborIndex::new(points, radius);
@@ -257,6 +258,14 @@ mod tests {
     }
 
     #[test]
+    fn every_number_has_a_bin() {
+        assert_eq!([-1.0, 0.0, 1.0].map(bin), [0, 5, 10]);
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -7.0, 7.0] {
+            assert!(bin(value) < BINS as u32, "{value}");
+        }
+    }
+
+    #[test]
     fn angles_are_angles() {
         for i in 0..720 {
             let angle = f64::from(i).to_radians() * 0.5 - std::f64::consts::PI + 0.001;
@@ -293,5 +302,7 @@ mod tests {
     #[test]
     fn a_lonely_point_has_the_zero_descriptor() {
         assert_eq!(fpfh(&[[0.0; 3]], &[[0.0, 0.0, 1.0]], 1.0), vec![[0.0; DESCRIPTOR_LEN]]);
+        // What is in the same place is no company.
+        assert_eq!(fpfh(&[[0.0; 3]; 2], &[[0.0, 0.0, 1.0]; 2], 1.0), vec![[0.0; DESCRIPTOR_LEN]; 2]);
     }
 }

@@ -1,5 +1,5 @@
 //! A scan made ready for matching: everything the pair and mapping layers read, in two forms. [`PreparedScan`] is plain data, to be
-//! stored; [`Scan`] adds the lookup grid, to be computed with.
+//! stored; [`Scan`] adds the lookup grid and its points as lookups read them, to be computed with.
 
 use std::sync::{Arc, OnceLock};
 

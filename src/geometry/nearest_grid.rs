@@ -23,8 +23,9 @@ const CORNERS: usize = 8;
 /// Top-level bricks at most, so that a stray point far away cannot make the table huge (16 MiB of it), and that the number of a
 /// brick and that of a cell in it fit into one word.
 const MAX_BRICKS: usize = 1 << 22;
-/// Of these along one axis at most, so that numbers in single precision tell its cells apart.
+/// Of these along one axis at most, so that the number of a cell along it is one that [`whole`] answers for.
 const MAX_ALONG: usize = 1 << 20;
+const _: () = assert!(MAX_ALONG * BRICK as usize <= 1 << 23);
 
 /// Constant-time lookup of a near point. Built once per scan.
 #[derive(Debug, Clone)]
@@ -372,5 +373,11 @@ mod tests {
         let grid = NearestGrid::new(&points, 0.05);
         assert!(grid.table.len() <= MAX_BRICKS + 1);
         assert_eq!(grid.nearest(&[2.5, 0.0, 0.0]).map(|i| i.abs_diff(50) <= 1), Some(true));
+
+        // In a row so long that there is room for its bricks, but that not all numbers of its cells are told apart: 2^23 cells from the points.
+        points[100] = [5e5, 0.0, 0.0];
+        let row = NearestGrid::new(&points, 0.05);
+        assert_eq!(row.nearest(&[2.5, 0.0, 0.0]), grid.nearest(&[2.5, 0.0, 0.0]));
+        assert_eq!(row.nearest(&[419_433.0, 0.0, 0.0]), None);
     }
 }

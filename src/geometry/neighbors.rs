@@ -15,7 +15,7 @@ use super::voxel_grid::{ByCell, cell_of};
 
 /// Points that are looked at together.
 const BLOCK: usize = 64;
-/// Points that are copied, and whose moments are summed, side by side. A block is a multiple of it.
+/// Points that are copied, and whose moments are summed, side by side.
 const LANES: usize = 16;
 /// Cells whose queries one thread answers in a row.
 const TOGETHER: usize = 64;

@@ -38,7 +38,7 @@ const THIRD: [f64; 13] = [
 ];
 
 impl Spread {
-    /// Of neighbourhoods of at least one point each, in closed form: eigenvalues of a symmetric matrix by the angle that its determinant gives, and the
+    /// Of neighbourhoods, in closed form; where there is no point nothing is a number. Eigenvalues of a symmetric matrix by the angle that its determinant gives, and the
     /// vector across the two rows of its remainder that span most (D. Eberly, "A Robust Eigensolver for 3 x 3 Symmetric Matrices", 2014).
     #[must_use]
     pub fn of_all(neighborhoods: &[Moments]) -> Vec<Self> {
@@ -179,6 +179,14 @@ mod tests {
                 assert!((found - (angle / 3.0).cos()).abs() < 1e-11, "{angle}: {found}");
             }
         }
+    }
+
+    #[test]
+    fn nothing_has_no_spread() {
+        let one = Moments { count: 1, ..Moments::default() };
+        let [nothing, point] = Spread::of_all(&[Moments::default(), one])[..] else { panic!("two go in") };
+        assert!(nothing.values.iter().all(|value| value.is_nan()));
+        assert_eq!(point.values, [0.0; 3]);
     }
 
     #[test]

@@ -151,9 +151,9 @@ mod tests {
         assert_eq!(occupied_voxels(&points, 0.5), 2);
         assert_eq!(voxel_groups(&points, 0.5), vec![vec![2], vec![0, 1]]);
 
-        // Points so far away that the shorter keys do not reach them, nor any.
-        for distance in [3e9, 9e17] {
-            let far = [points[0], [distance; 3], points[1], points[2]];
+        // Points so far away that the shorter numbers of cells do not reach them, nor any.
+        for far in [[3e9, 0.0, 0.0], [3e5; 3], [3e9; 3], [9e17; 3]] {
+            let far = [points[0], far, points[1], points[2]];
             assert_eq!(voxel_groups(&far, 0.5), vec![vec![3], vec![0, 2], vec![1]]);
         }
         let everywhere = [points[0], [f32::MAX; 3], points[1], points[2], [f32::MIN; 3]];

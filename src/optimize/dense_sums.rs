@@ -91,7 +91,8 @@ struct Block {
 }
 
 impl Block {
-    #[inline]
+    #[expect(clippy::inline_always, reason = "apart from what sums it is compiled for the least processor")]
+    #[inline(always)]
     fn of(few: &[Correspondence], i_from_j: &[[f64; 4]; 3]) -> Self {
         let (mut own, mut surface, mut normal) = ([[0.0; LANES]; 3], [[0.0; LANES]; 3], [[0.0; LANES]; 3]);
         let mut weight = [0.0; LANES];

@@ -62,7 +62,7 @@ pub fn coinciding(a: &Scan, b: &Scan, a_from_b: &Pose) -> Coinciding {
     let points = left.len() as u32;
     for _ in 0..PLANES {
         let Some(plane) = largest_plane(&left, THICKNESS_VOXELS * voxel) else { break };
-        left.retain(|surfel| !plane.holds(surfel));
+        left.retain(|one| !plane.holds(one));
     }
     Coinciding { points, beyond_planes: left.len() as u32 }
 }
@@ -91,17 +91,17 @@ struct Plane {
 }
 
 impl Plane {
-    fn holds(&self, surfel: &SharedPoint) -> bool {
+    fn holds(&self, shared: &SharedPoint) -> bool {
         let SharedPoint { point, normal } = &self.at;
-        normal.dot(&surfel.normal) > SAME_PLANE && normal.dot(&(surfel.point - point)).abs() < self.thickness
+        normal.dot(&shared.normal) > SAME_PLANE && normal.dot(&(shared.point - point)).abs() < self.thickness
     }
 
     /// The same through the middle of its points, across the mean of their normals.
-    fn settled(&self, surfels: &[SharedPoint]) -> Self {
+    fn settled(&self, shared: &[SharedPoint]) -> Self {
         let (mut point, mut normal, mut count) = (Vector3::zeros(), Vector3::zeros(), 0.0_f32);
-        for surfel in surfels.iter().filter(|surfel| self.holds(surfel)) {
-            point += surfel.point;
-            normal += surfel.normal;
+        for one in shared.iter().filter(|one| self.holds(one)) {
+            point += one.point;
+            normal += one.normal;
             count += 1.0;
         }
         let at = match normal.try_normalize(f32::MIN_POSITIVE) {
@@ -113,10 +113,10 @@ impl Plane {
 }
 
 /// The plane that holds most points.
-fn largest_plane(surfels: &[SharedPoint], thickness: f32) -> Option<Plane> {
-    let step = surfels.len().div_ceil(TRIED).max(1);
-    let count = |plane: &Plane| surfels.iter().filter(|surfel| plane.holds(surfel)).count();
-    let tried = surfels.iter().step_by(step).map(|at| Plane { at: *at, thickness });
+fn largest_plane(shared: &[SharedPoint], thickness: f32) -> Option<Plane> {
+    let step = shared.len().div_ceil(TRIED).max(1);
+    let count = |plane: &Plane| shared.iter().filter(|one| plane.holds(one)).count();
+    let tried = shared.iter().step_by(step).map(|at| Plane { at: *at, thickness });
     let (mut best, mut most) = (None, 0);
     for plane in tried {
         let held = count(&plane);
@@ -124,7 +124,7 @@ fn largest_plane(surfels: &[SharedPoint], thickness: f32) -> Option<Plane> {
             (best, most) = (Some(plane), held);
         }
     }
-    (0..ROUNDS).fold(best, |plane, _| plane.map(|plane| plane.settled(surfels)))
+    (0..ROUNDS).fold(best, |plane, _| plane.map(|plane| plane.settled(shared)))
 }
 
 #[cfg(test)]
