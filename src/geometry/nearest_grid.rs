@@ -5,7 +5,7 @@
 use multiversion::multiversion;
 
 use super::Point;
-use super::voxel_grid::cell_of;
+use super::voxel_grid::{box_of, cell_of};
 use super::whole::whole;
 
 /// Cells along the edge of a brick, as a power of two.
@@ -264,14 +264,7 @@ fn places(frame: &Frame, x: &[f32], y: &[f32], z: &[f32], found: &mut [u32]) {
 
 /// Cells that the grid covers: all points with their reach, or as large a middle part as the table may have.
 fn bounds(cells: &[[i64; 3]]) -> Option<([i64; 3], [i64; 3])> {
-    let mut low = *cells.first()?;
-    let mut high = low;
-    for cell in cells {
-        for k in 0..3 {
-            low[k] = low[k].min(cell[k]);
-            high[k] = high[k].max(cell[k]);
-        }
-    }
+    let (mut low, mut high) = box_of(cells)?;
     let mut trim = 1;
     loop {
         low = low.map(|cell| cell.saturating_sub(REACH));

@@ -103,6 +103,19 @@ fn ends<T: PartialEq>(sorted: impl Iterator<Item = T>) -> Vec<u32> {
     ends
 }
 
+/// The least and the greatest number along each axis of some cells; `None` without any.
+pub(super) fn box_of(cells: &[[i64; 3]]) -> Option<([i64; 3], [i64; 3])> {
+    let first = *cells.first()?;
+    let (mut low, mut high) = (first, first);
+    for cell in cells {
+        for k in 0..3 {
+            low[k] = low[k].min(cell[k]);
+            high[k] = high[k].max(cell[k]);
+        }
+    }
+    Some((low, high))
+}
+
 /// How far cells reach along each axis, so that one number can stand for each of them, in their order.
 struct Axes {
     low: [i64; 3],
@@ -112,14 +125,7 @@ struct Axes {
 impl Axes {
     /// Of cells, of which there must be some; `None` if they lie so far apart that the distance is no number.
     fn of(cells: &[[i64; 3]]) -> Option<Self> {
-        let mut low = *cells.first()?;
-        let mut high = low;
-        for cell in cells {
-            for k in 0..3 {
-                low[k] = low[k].min(cell[k]);
-                high[k] = high[k].max(cell[k]);
-            }
-        }
+        let (low, high) = box_of(cells)?;
         let mut bits = [0; 3];
         for k in 0..3 {
             bits[k] = u64::BITS - (high[k].checked_sub(low[k])? as u64).leading_zeros();
