@@ -86,7 +86,7 @@ fn voxel_grid(c: &mut Criterion) {
     c.bench_function("voxel_centroids", |b| b.iter(|| voxel_centroids(black_box(&f.clouds[0].points), size)));
 }
 
-/// Half of it finds and copies what is around the queries of a cell, in nine runs of points; a third is arithmetic: the distances of about three times as
+/// Half of it finds and copies what is around the queries of a cell, in nine runs of points; a fifth is arithmetic: the distances of about three times as
 /// many points as lie in the radius and sums of products over those that do, sixteen points at once; a tenth the closed form of eight normals at once. With an
 /// arccosine and two cosines for each normal, and cells sought anew for each query, it took twice as long. A kd-tree branches for every few
 /// points: with one, lookups were two fifths of preparing a scan.
@@ -101,7 +101,7 @@ fn surface_normals(c: &mut Criterion) {
 
 /// About 100 neighbours a point, each pair looked at once, in four parts of like size: finding it; its three angles, which are bound by the divisions and
 /// roots of sixteen pairs at once; counting them, by stores; and adding the histogram of each of the two to the other's sum, by the second-level cache.
-/// Where angles became numbers of bins through the language's conversion, which takes one at a time, they took twice as long; with one arctangent at
+/// Where angles became numbers of bins through the language's conversion, which takes one at a time, they took half as long again; with one arctangent at
 /// a time through libm, longer than all of this.
 fn descriptors(c: &mut Criterion) {
     let f = &*FIXTURE;
@@ -110,7 +110,7 @@ fn descriptors(c: &mut Criterion) {
     c.bench_function("fpfh", |b| b.iter(|| fpfh(black_box(&scan.points), &scan.normals, radius)));
 }
 
-/// Bound by the throughput of fused multiply-add: 512 waves times all points times 33 numbers, as one product of matrices; a quarter is the cosine of
+/// Bound by the throughput of fused multiply-add: 512 waves times all points times 33 numbers, as one product of matrices; a third is the cosine of
 /// each, as a polynomial. Calling libm's cosine made it ten times as long; sums for one vector of points at a time, which wait for each other, twice.
 fn signatures(c: &mut Criterion) {
     let f = &*FIXTURE;
