@@ -13,6 +13,7 @@ pub mod pose_text;
 mod rigid_fit;
 mod robust;
 mod spread;
+mod surroundings;
 mod voxel_grid;
 mod whole;
 
