@@ -75,7 +75,7 @@ impl TestGraph {
     }
 }
 
-/// A second regression that hands on what the first one said.
+/// A regression with triplets that hands on what the pair said.
 fn says_nothing_of_triplets() -> SupportOptions {
     let mut options = SupportOptions::default();
     let verifier = Arc::make_mut(&mut options.verifier);

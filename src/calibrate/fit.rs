@@ -1,4 +1,4 @@
-//! From labelled scenes to the two regressions, and what they say of scenes that they did not see.
+//! From labelled scenes to the regressions, and what they say of scenes that they did not see.
 
 use std::sync::Arc;
 
@@ -11,11 +11,11 @@ use super::view::View;
 use crate::control::{Cancelled, Control, Stage};
 use crate::features::{PreparedScan, Scan};
 use crate::graph::{ScanGraph, SupportOptions, triplet_features};
-use crate::pairwise::{Appearance, Evidence, Logistic, PairResult, Verifier};
+use crate::pairwise::{Appearance, Evidence, Logistic, PairResult, Verifier, by_shape, is_looked_at_closely};
 
 /// Places are dealt to so many folds; each is predicted by a fit on the others.
 const FOLDS: usize = 5;
-/// Views whose graphs teach the second regression.
+/// Views whose graphs teach the regression with triplets.
 const GRAPH_VIEWS: [View; 2] = [View::Full, View::Blind];
 
 /// Why no weights can be fitted.
@@ -44,7 +44,7 @@ pub struct Prediction {
     pub view: View,
     /// Whether the pose is right.
     pub right: bool,
-    /// Log-odds from the pair alone.
+    /// Log-odds from the shapes of the pair alone, at half the voxel where it was looked at there.
     pub pair_logit: f64,
     /// Log-odds with triplets.
     pub logit: f64,
@@ -53,64 +53,82 @@ pub struct Prediction {
 /// Fitted regressions.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
-    /// On a pair alone.
+    /// On a pair alone, at the voxel.
     pub pair: Logistic,
+    /// On that and what shows at half the voxel; `None` where no two scans have such surfaces, or nothing wrong was looked at there.
+    pub detail: Option<Logistic>,
     /// On a pair and what third scans say.
     pub triplet: Logistic,
     /// On colours, beside what a pair says without them; `None` where no two scans have any.
     pub appearance: Option<Logistic>,
-    /// Of every labelled hypothesis, by regressions that saw no scene of its place.
+    /// Of every labelled hypothesis, by regressions that saw no scene of its place. Those after the first took log-odds of other places from fits that did.
     pub held_out: Vec<Prediction>,
 }
 
 impl Fit {
-    /// Fits both regressions. The second learns from log-odds of the first that are out of fold: of scenes that it was fitted on
-    /// they would be too good, and the second would trust it too much.
+    /// Fits all regressions. Each learns from log-odds of the one before that are out of fold: of scenes that it was fitted on they would be too
+    /// good, and the next would trust it too much.
     pub fn of(scenes: &[&MatchedScene], control: Control<'_>) -> Result<Self, FitError> {
         let folds = folds(scenes)?;
-        let examples: Vec<Vec<Example>> = scenes.iter().map(|scene| pair_examples(scene)).collect();
-        let steps = 2 * folds.len() + 2;
+        let steps = 3 * folds.len();
         let step = |done| -> Result<(), Cancelled> {
             control.report(Stage::Support, done, steps);
             control.check()
         };
         let names = |fold: &[usize]| fold.iter().map(|s| scenes[*s].name.clone()).collect();
-        let without = |fold: &[usize], examples: &[Vec<Example>]| {
-            let pooled =
-                pooled(examples.iter().enumerate().filter(|(s, _)| !fold.contains(s)).map(|(_, e)| e));
-            fit(&pooled).ok_or_else(|| FitError::OneLabel { without: names(fold) })
+        let learned = |fold: &[usize], examples: &[Vec<Example>]| {
+            let others = examples.iter().enumerate().filter(|(s, _)| !fold.contains(s)).map(|(_, e)| e);
+            fit(&pooled(others))
         };
-        let mut judged: Vec<Vec<Judged>> = vec![Vec::new(); scenes.len()];
+        let without = |fold: &[usize], examples: &[Vec<Example>]| {
+            learned(fold, examples).ok_or_else(|| FitError::OneLabel { without: names(fold) })
+        };
+        let of_pairs: Vec<Vec<Example>> = scenes.iter().map(|scene| pair_examples(scene)).collect();
+        let mut pairs = Vec::with_capacity(folds.len());
+        let mut of_detail: Vec<Vec<Example>> = vec![Vec::new(); scenes.len()];
         for (done, fold) in folds.iter().enumerate() {
             step(done)?;
-            let pair = without(fold, &examples)?;
-            let fresh: Vec<Vec<Judged>> = fold.par_iter().map(|s| hypotheses(scenes[*s], &pair)).collect();
+            let pair = without(fold, &of_pairs)?;
+            for s in fold {
+                of_detail[*s] = detail_examples(scenes[*s], &pair);
+            }
+            pairs.push(pair);
+        }
+        let mut judged: Vec<Vec<Judged>> = vec![Vec::new(); scenes.len()];
+        for (done, (fold, pair)) in folds.iter().zip(&pairs).enumerate() {
+            step(folds.len() + done)?;
+            let detail = learned(fold, &of_detail);
+            let fresh: Vec<Vec<Judged>> =
+                fold.par_iter().map(|s| hypotheses(scenes[*s], pair, detail.as_ref())).collect();
             for (s, fresh) in fold.iter().zip(fresh) {
                 judged[*s] = fresh;
             }
         }
-        step(folds.len())?;
-        let pair = without(&[], &examples)?;
-        let examples: Vec<Vec<Example>> = judged.iter().map(|judged| triplet_examples(judged)).collect();
+        let of_triplets: Vec<Vec<Example>> = judged.iter().map(|judged| triplet_examples(judged)).collect();
         let mut held_out = Vec::new();
         for (done, fold) in folds.iter().enumerate() {
-            step(folds.len() + 1 + done)?;
-            let triplet = without(fold, &examples)?;
+            step(2 * folds.len() + done)?;
+            let triplet = without(fold, &of_triplets)?;
             held_out.extend(fold.iter().flat_map(|s| predictions(*s, &judged[*s], &triplet)));
         }
         held_out.sort_by_key(|p| p.scene);
-        let triplet = without(&[], &examples)?;
-        let on_colors: Vec<Vec<Example>> = judged.iter().map(|judged| appearance_examples(judged)).collect();
-        let appearance = fit(&pooled(on_colors.iter()));
+        let of_colors: Vec<Vec<Example>> = judged.iter().map(|judged| appearance_examples(judged)).collect();
+        let fitted = Self {
+            pair: without(&[], &of_pairs)?,
+            detail: learned(&[], &of_detail),
+            triplet: without(&[], &of_triplets)?,
+            appearance: learned(&[], &of_colors),
+            held_out,
+        };
         step(steps)?;
-        Ok(Self { pair, triplet, appearance, held_out })
+        Ok(fitted)
     }
 }
 
 /// What a verifier says of the labelled hypotheses of a scene; `scene` is noted in each prediction.
 #[must_use]
 pub fn judge(verifier: &Verifier, scene: usize, of: &MatchedScene) -> Vec<Prediction> {
-    predictions(scene, &hypotheses(of, &verifier.pair), &verifier.triplet)
+    predictions(scene, &hypotheses(of, &verifier.pair, verifier.detail.as_ref()), &verifier.triplet)
 }
 
 /// Scenes by fold, dealt so that real and simulated ones spread evenly; a place is in one fold only.
@@ -152,7 +170,26 @@ fn pair_examples(scene: &MatchedScene) -> Vec<Example> {
     examples
 }
 
-/// Examples for the second regression, weighted by [`share_out`].
+/// What is to be learned at half the voxel of poses that are looked at there, given what the regression at the voxel, which did not see the scene,
+/// says.
+fn detail_examples(scene: &MatchedScene, pair: &Logistic) -> Vec<Example> {
+    let evidence = scene.pairs.iter().flat_map(|pair| pair.result.hypotheses.iter().zip(&pair.labels));
+    let seen = evidence.filter_map(|(hypothesis, label)| {
+        let log_odds = pair.logit(&hypothesis.evidence.features(scene.resolution));
+        let features = hypothesis.evidence.detail?.features(log_odds, scene.resolution).to_vec();
+        is_looked_at_closely(log_odds).then_some(Example {
+            features,
+            offset: 0.0,
+            right: label.is_right()?,
+            weight: 1.0,
+        })
+    });
+    let mut examples: Vec<Example> = seen.collect();
+    share_out(&mut examples);
+    examples
+}
+
+/// Examples for the regression with triplets, weighted by [`share_out`].
 fn triplet_examples(judged: &[Judged]) -> Vec<Example> {
     let mut examples: Vec<Example> = judged
         .iter()
@@ -204,7 +241,7 @@ fn pooled<'e>(scenes: impl Iterator<Item = &'e Vec<Example>>) -> Vec<Example> {
 struct Judged {
     view: View,
     right: bool,
-    /// Of the second regression; the first of them is the pair's log-odds.
+    /// Of the regression with triplets; the first of them is the pair's log-odds.
     features: Vec<f64>,
     /// How colours agree ([`Evidence::appearance`]).
     appearance: Option<Appearance>,
@@ -222,7 +259,7 @@ fn predictions(scene: usize, judged: &[Judged], triplet: &Logistic) -> Vec<Predi
 }
 
 /// Builds the scan graph of a scene in each view and takes the features of every labelled hypothesis.
-fn hypotheses(scene: &MatchedScene, pair: &Logistic) -> Vec<Judged> {
+fn hypotheses(scene: &MatchedScene, pair: &Logistic, detail: Option<&Logistic>) -> Vec<Judged> {
     let options = SupportOptions::default();
     let mut judged = Vec::new();
     for view in GRAPH_VIEWS {
@@ -234,8 +271,8 @@ fn hypotheses(scene: &MatchedScene, pair: &Logistic) -> Vec<Judged> {
         for scan in &scene.scans {
             graph.add_scan(Arc::new(outline(scan, scene.resolution)));
         }
-        graph
-            .add_results(scene.pairs.iter().map(|p| seen(&p.result, view, pair, scene.resolution)), &options);
+        let results = scene.pairs.iter().map(|p| seen(&p.result, view, pair, detail, scene.resolution));
+        graph.add_results(results, &options);
         for matched in &scene.pairs {
             let Some(edge) = graph.edge(matched.result.pair.a, matched.result.pair.b) else { continue };
             let features = triplet_features(&graph, edge, &options);
@@ -256,12 +293,18 @@ fn hypotheses(scene: &MatchedScene, pair: &Logistic) -> Vec<Judged> {
     judged
 }
 
-/// A pair's result as this view and regression have it.
-fn seen(result: &PairResult, view: View, pair: &Logistic, voxel: f64) -> PairResult {
+/// A pair's result as this view and these regressions have it.
+fn seen(
+    result: &PairResult,
+    view: View,
+    pair: &Logistic,
+    detail: Option<&Logistic>,
+    voxel: f64,
+) -> PairResult {
     let mut result = PairResult { matches: Vec::new(), ..result.clone() };
     for hypothesis in &mut result.hypotheses {
         let evidence = view.of(&hypothesis.evidence).unwrap_or(hypothesis.evidence);
-        hypothesis.logit = pair.logit(&evidence.features(voxel));
+        hypothesis.logit = by_shape(pair, detail, &evidence, voxel);
     }
     result.hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));
     result

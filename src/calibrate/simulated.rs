@@ -144,6 +144,20 @@ fn sketches() -> Vec<Sketch> {
             ..usual("office-fragments-hard", Layout::Office, fragment)
         },
         Sketch { stations: 40, noise: 1.5, ..usual("house-depth-camera", Layout::House, camera) },
+        // Few views of few walls: what looks right and is wrong is most common here, and most varied.
+        Sketch { stations: 44, ..usual("house-depth-camera-usual", Layout::House, camera) },
+        Sketch { stations: 44, rooms: 5, ..usual("house-depth-camera-small", Layout::House, camera) },
+        Sketch { stations: 44, rooms: 8, ..usual("house-depth-camera-large", Layout::House, camera) },
+        Sketch { stations: 44, density: 0.6, ..usual("house-depth-camera-bare", Layout::House, camera) },
+        Sketch {
+            stations: 44,
+            density: 1.4,
+            people: 1,
+            hazards: hard,
+            ..usual("house-depth-camera-hard", Layout::House, camera)
+        },
+        Sketch { stations: 36, ..usual("office-depth-camera", Layout::Office, camera) },
+        Sketch { stations: 36, ..usual("corridor-depth-camera", Layout::Corridor, camera) },
     ]
 }
 

@@ -35,12 +35,15 @@ impl View {
             Self::OneEyed => (evidence.range_images == 2).then(|| Evidence {
                 a_on_b: unseen(&evidence.a_on_b),
                 range_images: 1,
+                // Finer surfaces come with a range image.
+                detail: None,
                 ..*evidence
             }),
             Self::Blind => (evidence.range_images > 0).then(|| Evidence {
                 a_on_b: unseen(&evidence.a_on_b),
                 b_on_a: unseen(&evidence.b_on_a),
                 range_images: 0,
+                detail: None,
                 ..*evidence
             }),
         }

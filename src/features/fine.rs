@@ -1,5 +1,5 @@
-//! The surfaces of a scan at half its voxel, for second looks: where two poses of a pair both look right, what tells them apart is often
-//! smaller than a voxel. Its points are kept packed, and unpacked where poses of a pair rival each other, joins are weighed or pairs that contradict are heard.
+//! The surfaces of a scan at half its voxel, for close looks: what tells a right pose from one that only looks right is often
+//! smaller than a voxel. Its points are kept packed, and unpacked where poses of a pair may be right, joins are weighed or pairs that contradict are heard.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

@@ -15,7 +15,7 @@ use crate::features::Scan;
 use crate::geometry::Pose;
 use crate::pairwise::{Hypothesis, PairKey, PairResult, Probe, match_pair, probe};
 
-/// Pairs that are matched before the memory that their second looks took is given back.
+/// Pairs that are matched before the memory that their close looks took is given back.
 const BLOCK: usize = 512;
 /// Scans whose finer surfaces stay in memory while joins are weighed, at most.
 const UNPACKED: usize = 64;
@@ -199,7 +199,7 @@ impl ScanGraph {
         Ok(results)
     }
 
-    /// Gives back the memory that second looks took ([`Scan::fine`]).
+    /// Gives back the memory that close looks took ([`Scan::fine`]).
     pub fn forget_fine(&self) {
         for scan in self.scans.values() {
             scan.forget_fine();

@@ -94,7 +94,7 @@ pub(super) fn support(
         .collect()
 }
 
-/// The features of the second regression for each hypothesis of an edge: the pair's log-odds, log support, the same of the best
+/// The features of the regression with triplets for each hypothesis of an edge: the pair's log-odds, log support, the same of the best
 /// different pose of the pair, and log opposition. Nothing is corrected: how rare right poses are is part of what is fitted.
 #[must_use]
 pub fn triplet_features(

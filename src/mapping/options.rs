@@ -69,7 +69,13 @@ impl MappingOptions {
     /// Whether a level asks as much as any.
     #[must_use]
     pub fn is_strictest(&self, level: &JoinLevel) -> bool {
-        self.levels.iter().all(|other| other.support <= level.support)
+        level.support >= self.most_support()
+    }
+
+    /// The most support that any level asks.
+    #[must_use]
+    pub fn most_support(&self) -> f64 {
+        self.levels.iter().map(|level| level.support).fold(0.0, f64::max)
     }
 
     /// Whether a join of pieces of so many scans must rest on more than one edge: what two pieces of several scans share in one pair alone is

@@ -89,6 +89,17 @@ pub(super) fn share(part: u32, whole: u32) -> f64 {
 /// Looks at every `stride`-th point of `other` against what `scan` holds and saw.
 #[must_use]
 pub fn look(scan: &Scan, other: &Scan, scan_from_other: &Pose, stride: usize) -> Counts {
+    look_through(scan, other, scan_from_other, stride, |_| ())
+}
+
+/// The same, and shows every block of points on the way.
+pub(super) fn look_through(
+    scan: &Scan,
+    other: &Scan,
+    scan_from_other: &Pose,
+    stride: usize,
+    mut show: impl FnMut(&Contacts),
+) -> Counts {
     let near = Near::at(scan.prepared.resolution as f32);
     let motion = Motion::of(scan_from_other);
     let mut counts = Counts::default();
@@ -97,6 +108,7 @@ pub fn look(scan: &Scan, other: &Scan, scan_from_other: &Pose, stride: usize) ->
     while let Some(next) = block.fill(scan, other, &motion, first, stride.max(1)) {
         first = next;
         counts = counts.plus(&on_surface(&block, &near));
+        show(&block);
         let Some(image) = &scan.prepared.range_image else { continue };
         // So near a surface nothing can be clearly in front of it: only the other points are judged.
         let mut len = 0;

@@ -3,6 +3,7 @@
 
 use nalgebra::Vector3;
 
+use super::contacts::{Contacts, Motion};
 use crate::features::Scan;
 use crate::geometry::Pose;
 
@@ -47,40 +48,58 @@ impl Coinciding {
 
 /// A point of both scans and its normal, metres, frame of a.
 #[derive(Clone, Copy)]
-struct SharedPoint {
-    point: Vector3<f32>,
-    normal: Vector3<f32>,
+pub(super) struct SharedPoint {
+    pub point: Vector3<f32>,
+    pub normal: Vector3<f32>,
 }
 
 /// What of two scans coincides at a pose (b to a, local frames).
 #[must_use]
 pub fn coinciding(a: &Scan, b: &Scan, a_from_b: &Pose) -> Coinciding {
-    let voxel = a.prepared.resolution as f32;
-    let mut left = shared(a, b, a_from_b, NEAR_VOXELS * voxel);
-    let step = left.len().div_ceil(POINTS).max(1);
-    left = left.into_iter().step_by(step).collect();
-    let points = left.len() as u32;
-    for _ in 0..PLANES {
-        let Some(plane) = largest_plane(&left, THICKNESS_VOXELS * voxel) else { break };
-        left.retain(|one| !plane.holds(one));
+    let motion = Motion::of(a_from_b);
+    let (mut block, mut first, mut shared) = (Contacts::new(), 0, Vec::new());
+    while let Some(next) = block.fill(a, b, &motion, first, 1) {
+        first = next;
+        shared_in(&block, a, &mut shared);
     }
-    Coinciding { points, beyond_planes: left.len() as u32 }
+    let looked_at = evenly(&shared, POINTS);
+    let points = looked_at.len() as u32;
+    let [beyond_planes] = beyond_largest_planes(looked_at, a.prepared.resolution, [PLANES]);
+    Coinciding { points, beyond_planes }
 }
 
-/// The points of a that points of b coincide with, one for each of these.
-fn shared(a: &Scan, b: &Scan, a_from_b: &Pose, reach: f32) -> Vec<SharedPoint> {
-    let (of_a, of_b) = (&a.prepared, &b.prepared);
-    let turn = a_from_b.rotation.cast::<f32>();
-    let carried = of_b.points.iter().zip(&of_b.normals);
-    carried
-        .filter_map(|(point, normal)| {
-            let point = a_from_b.transform_point(*point);
-            let at = a.grid.nearest(&point)?;
-            let met = SharedPoint { point: of_a.points[at].into(), normal: of_a.normals[at].into() };
-            let is_near = (met.point - Vector3::from(point)).norm_squared() < reach * reach;
-            (is_near && met.normal.dot(&(turn * Vector3::from(*normal))) > SAME_SURFACE).then_some(met)
-        })
-        .collect()
+/// Adds the points of a that those of a block coincide with, one for each of these.
+pub(super) fn shared_in(block: &Contacts, a: &Scan, shared: &mut Vec<SharedPoint>) {
+    let reach = NEAR_VOXELS * a.prepared.resolution as f32;
+    for i in 0..block.len {
+        if block.square[i] < reach * reach && block.agreement(i) > SAME_SURFACE {
+            let met = &a.surfels[block.near(i)];
+            shared.push(SharedPoint { point: met.position.into(), normal: met.normal.into() });
+        }
+    }
+}
+
+/// At most so many of them, evenly spread.
+pub(super) fn evenly(shared: &[SharedPoint], most: usize) -> Vec<SharedPoint> {
+    shared.iter().step_by(shared.len().div_ceil(most).max(1)).copied().collect()
+}
+
+/// How many of them lie on none of the largest planes, after so many of these (ascending) are taken away; `voxel` in metres.
+pub(super) fn beyond_largest_planes<const N: usize>(
+    mut left: Vec<SharedPoint>,
+    voxel: f64,
+    planes: [usize; N],
+) -> [u32; N] {
+    let thickness = THICKNESS_VOXELS * voxel as f32;
+    let mut taken = 0;
+    planes.map(|planes| {
+        for _ in taken..planes {
+            let Some(plane) = largest_plane(&left, thickness) else { break };
+            left.retain(|one| !plane.holds(one));
+        }
+        taken = planes;
+        left.len() as u32
+    })
 }
 
 /// A plane of some thickness, seen from one side.

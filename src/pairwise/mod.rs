@@ -5,6 +5,7 @@ mod appearance;
 mod consensus;
 mod contacts;
 mod dense;
+mod detail;
 mod distinct;
 mod gravity;
 mod icp;
@@ -22,6 +23,7 @@ pub use appearance::{Appearance, appearance};
 pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, agreement, centred_difference, consensus};
 pub(crate) use contacts::{Contacts, Motion};
 pub use dense::{Counts, look, quick_overlap};
+pub use detail::{DETAIL_FEATURES, Detail, detail};
 pub use distinct::{Coinciding, coinciding};
 pub use gravity::{is_level, is_upright};
 pub use icp::{icp, perturbed_about};
@@ -33,5 +35,5 @@ pub use second_look::{is_clearly_worse, look_finely, look_leniently, preference}
 pub use shortlist::shortlist;
 pub use verifier::{
     Evidence, FEATURES, FittedScene, Logistic, Provenance, TRIPLET_FEATURES, Verifier, VerifierError,
-    shipped_verifier,
+    by_shape, is_looked_at_closely, shipped_verifier,
 };

@@ -5,12 +5,13 @@ use serde::{Deserialize, Serialize};
 use super::appearance::appearance;
 use super::consensus::{INLIER_VOXELS, agreement, centred_difference};
 use super::dense::look;
+use super::detail::detail;
 use super::gravity::is_upright;
 use super::icp::icp;
 use super::matching::mutual_matches;
 use super::second_look::contest;
 use super::shortlist::shortlist;
-use super::verifier::{Evidence, Verifier};
+use super::verifier::{Evidence, Verifier, is_looked_at_closely};
 use crate::cloud::ScanKey;
 use crate::features::Scan;
 use crate::geometry::Pose;
@@ -71,21 +72,21 @@ pub struct PairResult {
 /// poses that are hopeless is counted on some of the points, which stand for all.
 #[must_use]
 pub fn match_pair(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
-    match_and_verify(x, y, verifier, true)
-}
-
-/// The same with all evidence counted on all points, whatever the verifier makes of it: what one is fitted to.
-#[must_use]
-pub fn match_pair_in_full(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
     match_and_verify(x, y, verifier, false)
 }
 
-fn match_and_verify(x: &Scan, y: &Scan, verifier: &Verifier, glance: bool) -> PairResult {
+/// The same with all evidence counted on all points, and all poses looked at closely, whatever the verifier makes of them: what one is fitted to.
+#[must_use]
+pub fn match_pair_in_full(x: &Scan, y: &Scan, verifier: &Verifier) -> PairResult {
+    match_and_verify(x, y, verifier, true)
+}
+
+fn match_and_verify(x: &Scan, y: &Scan, verifier: &Verifier, in_full: bool) -> PairResult {
     let (a, b) = if x.key() < y.key() { (x, y) } else { (y, x) };
     let pair = PairKey { a: a.key(), b: b.key() };
     let matches = mutual_matches(&a.prepared, &b.prepared, MAX_MATCHES);
     // Of small scans a glance is all there is to see.
-    let glance = glance && [a, b].iter().any(|scan| scan.prepared.points.len() >= 2 * GLANCED);
+    let glance = !in_full && [a, b].iter().any(|scan| scan.prepared.points.len() >= 2 * GLANCED);
     let mut hypotheses: Vec<Hypothesis> = Vec::with_capacity(REFINED);
     for candidate in shortlist(a, b, &matches, REFINED) {
         let a_from_b = icp(a, b, &candidate.a_from_b);
@@ -111,12 +112,20 @@ fn match_and_verify(x: &Scan, y: &Scan, verifier: &Verifier, glance: bool) -> Pa
                 matches: matches.len() as u32,
                 range_images: [a, b].iter().filter(|scan| scan.prepared.range_image.is_some()).count() as u32,
                 appearance,
+                detail: None,
             };
             let logit = verifier.pair_logit(&evidence, a.prepared.resolution);
             Hypothesis { a_from_b, evidence, logit }
         };
         let glanced = glance.then(|| verified(GLANCED)).filter(|at_a_glance| at_a_glance.logit < HOPELESS);
         hypotheses.push(glanced.unwrap_or_else(|| verified(usize::MAX)));
+    }
+    let voxel = a.prepared.resolution;
+    for hypothesis in &mut hypotheses {
+        if in_full || is_looked_at_closely(verifier.pair.logit(&hypothesis.evidence.features(voxel))) {
+            hypothesis.evidence.detail = detail(a, b, &hypothesis.a_from_b);
+            hypothesis.logit = verifier.pair_logit(&hypothesis.evidence, voxel);
+        }
     }
     contest(a, b, &mut hypotheses);
     hypotheses.sort_by(|x, y| y.logit.total_cmp(&x.logit));
@@ -161,7 +170,7 @@ mod tests {
         .expect("the options are valid");
         let scans = prepared(&office, 0.15);
         let verifier = shipped_verifier();
-        let (mut glanced, mut looked_at) = (0, 0);
+        let (mut glanced, mut looked_at, mut closely) = (0, 0, 0);
         for (i, (a, _)) in scans.iter().enumerate() {
             for (b, _) in &scans[..i] {
                 let quick = match_pair(a, b, &verifier);
@@ -173,7 +182,13 @@ mod tests {
                 for known in &full.hypotheses {
                     let same = |h: &&Hypothesis| h.a_from_b == known.a_from_b;
                     let found = quick.hypotheses.iter().find(same).expect("the poses are the same");
-                    if found.evidence == known.evidence {
+                    let coarsely = |h: &Hypothesis| Evidence { detail: None, ..h.evidence };
+                    let likely = is_looked_at_closely(
+                        verifier.pair.logit(&found.evidence.features(a.prepared.resolution)),
+                    );
+                    assert_eq!(found.evidence.detail, known.evidence.detail.filter(|_| likely));
+                    closely += usize::from(found.evidence.detail.is_some());
+                    if coarsely(found) == coarsely(known) {
                         looked_at += 1;
                     } else {
                         assert!(
@@ -188,5 +203,6 @@ mod tests {
             }
         }
         assert!(glanced > 10 && looked_at > 20, "{glanced} poses were hopeless, {looked_at} not");
+        assert!(closely > 10 && closely < looked_at, "{closely} of {looked_at} were looked at closely");
     }
 }

@@ -81,7 +81,11 @@ pub(super) fn contest(a: &Scan, b: &Scan, hypotheses: &mut [Hypothesis]) {
         return;
     }
     let voxel = a.prepared.resolution / 2.0;
-    let seen: Option<Vec<Counts>> = running.iter().map(|h| look_finely(a, b, &h.a_from_b)).collect();
+    let seen_finely = |h: &Hypothesis| match &h.evidence.detail {
+        Some(detail) => Some(detail.looked_at()),
+        None => look_finely(a, b, &h.a_from_b),
+    };
+    let seen: Option<Vec<Counts>> = running.iter().map(|h| seen_finely(h)).collect();
     let Some(seen) = seen else { return };
     for (hypothesis, mine) in running.iter_mut().zip(&seen) {
         if seen.iter().any(|other| is_clearly_worse(other, mine, voxel)) {
@@ -104,8 +108,8 @@ fn log_distance(counts: &Counts, voxel: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::features::PreparedScan;
-    use crate::pairwise::Evidence;
     use crate::pairwise::test_survey::{Hall, hall};
+    use crate::pairwise::{Evidence, detail};
 
     #[test]
     fn a_pose_at_which_little_meets_is_never_the_better_one() {
@@ -168,9 +172,15 @@ mod tests {
         let at = |pose: Pose, logit: f64| Hypothesis { a_from_b: pose, evidence: Evidence::default(), logit };
         let truth = model_from_a.inverse() * *model_from_b;
         let wrong = model_from_a.inverse() * turned * *model_from_b;
-        let mut both = [at(wrong, 6.0), at(truth, 5.0)];
-        contest(a, b, &mut both);
-        assert!(both[0].logit < both[1].logit && both[1].logit == 5.0, "{both:?}");
+        let closely = |pose: Pose, logit: f64| {
+            let evidence = Evidence { detail: detail(a, b, &pose), ..Evidence::default() };
+            Hypothesis { evidence, ..at(pose, logit) }
+        };
+        // Whether it was seen closely before, or is looked at now.
+        for mut both in [[at(wrong, 6.0), at(truth, 5.0)], [closely(wrong, 6.0), closely(truth, 5.0)]] {
+            contest(a, b, &mut both);
+            assert!(both[0].logit < both[1].logit && both[1].logit == 5.0, "{both:?}");
+        }
         // Who is alone, or far ahead, has no rival to be compared with.
         for logits in [vec![6.0], vec![6.0, -4.0]] {
             let mut alone: Vec<Hypothesis> = logits.iter().map(|logit| at(wrong, *logit)).collect();

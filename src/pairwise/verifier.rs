@@ -10,14 +10,17 @@ use serde::{Deserialize, Serialize};
 
 use super::appearance::Appearance;
 use super::dense::{Counts, share};
+use super::detail::{DETAIL_FEATURES, Detail};
 
 /// Numbers that describe the evidence for a pose.
 pub const FEATURES: usize = 15;
-/// Numbers that the second regression takes: what the first one says, and what third scans do (`graph::triplet_features`).
+/// Numbers that the regression with triplets takes: what the pair says, and what third scans do (`graph::triplet_features`).
 pub const TRIPLET_FEATURES: usize = 5;
 
 /// Numbers that the regression on colours takes.
 pub const APPEARANCE_FEATURES: usize = 2;
+/// Poses with more log-odds than this, by what shows at the voxel, are looked at closely, at half of it: what is less likely is taken for wrong anyhow.
+const CLOSELY: f64 = -3.0;
 /// Colours lower the log-odds by this at most: light, and what sensors make of it, vary more than any calibration shows. They never
 /// raise them: places that are painted alike are many.
 const MOST_AGAINST: f64 = 3.0;
@@ -39,6 +42,8 @@ pub struct Evidence {
     pub range_images: u32,
     /// How alike the colours are that meet, if both scans have enough of them.
     pub appearance: Option<Appearance>,
+    /// What shows at half the voxel, if both scans have such surfaces and it was looked at.
+    pub detail: Option<Detail>,
 }
 
 impl Evidence {
@@ -170,13 +175,16 @@ pub struct FittedScene {
     pub left_out: usize,
 }
 
-/// The two regressions that judge poses. The engine takes one as an argument; by default the shipped one.
+/// The regressions that judge poses. The engine takes them as an argument; by default the shipped ones.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Verifier {
     /// How the weights were made.
     pub provenance: Provenance,
-    /// On a pair alone.
+    /// On a pair alone, at the voxel.
     pub pair: Logistic,
+    /// On its log-odds and what shows at half the voxel. Without it that says nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub detail: Option<Logistic>,
     /// On a pair and what third scans say.
     pub triplet: Logistic,
     /// On the colours that meet: what they take from the log-odds of a pair. Without it colours say nothing.
@@ -193,7 +201,7 @@ pub enum VerifierError {
     /// It was fitted on other features than this engine measures.
     #[error("the {regression} regression does not take {features} features with a weight for each term")]
     Features {
-        /// `pair`, `triplet` or `appearance`.
+        /// `pair`, `triplet`, `detail` or `appearance`.
         regression: &'static str,
         /// What this engine measures.
         features: usize,
@@ -220,8 +228,9 @@ impl Verifier {
     pub fn parse(json: &str) -> Result<Self, VerifierError> {
         let verifier: Self = serde_json::from_str(json)?;
         let always = [("pair", &verifier.pair, FEATURES), ("triplet", &verifier.triplet, TRIPLET_FEATURES)];
+        let on_detail = verifier.detail.iter().map(|of| ("detail", of, DETAIL_FEATURES));
         let on_colors = verifier.appearance.iter().map(|of| ("appearance", of, APPEARANCE_FEATURES));
-        for (regression, logistic, features) in always.into_iter().chain(on_colors) {
+        for (regression, logistic, features) in always.into_iter().chain(on_detail).chain(on_colors) {
             if !logistic.fits(features) {
                 return Err(VerifierError::Features { regression, features });
             }
@@ -237,8 +246,23 @@ impl Verifier {
             .as_ref()
             .zip(evidence.appearance)
             .map_or(0.0, |(of, seen)| of.logit(&seen.features()).clamp(-MOST_AGAINST, 0.0));
-        self.pair.logit(&evidence.features(voxel)) + by_colors
+        by_shape(&self.pair, self.detail.as_ref(), evidence, voxel) + by_colors
     }
+}
+
+/// Whether poses of these log-odds, by what shows at the voxel, are looked at closely.
+#[must_use]
+pub fn is_looked_at_closely(coarsely: f64) -> bool {
+    coarsely > CLOSELY
+}
+
+/// The log-odds of a pose from the shapes of a pair alone: of the regression at the voxel (metres), or, where it is looked at closely, of that
+/// on top.
+#[must_use]
+pub fn by_shape(pair: &Logistic, detail: Option<&Logistic>, evidence: &Evidence, voxel: f64) -> f64 {
+    let coarsely = pair.logit(&evidence.features(voxel));
+    let seen = evidence.detail.as_ref().filter(|_| is_looked_at_closely(coarsely));
+    detail.zip(seen).map_or(coarsely, |(of, seen)| of.logit(&seen.features(coarsely, voxel)))
 }
 
 /// The verifier that ships with the product.
@@ -262,6 +286,45 @@ mod tests {
     fn the_shipped_weights_fit_the_features() {
         let verifier = shipped_verifier();
         assert!(verifier.pair.fits(FEATURES) && verifier.triplet.fits(TRIPLET_FEATURES));
+    }
+
+    #[test]
+    fn what_shows_at_half_the_voxel_counts_where_a_pose_is_likely_enough() {
+        let shipped = shipped_verifier();
+        assert!(shipped.detail.as_ref().is_some_and(|of| of.fits(DETAIL_FEATURES)));
+        let counts = |inliers, violations| Counts {
+            points: 4000,
+            inliers,
+            tight: inliers / 2,
+            violations,
+            plane_square: 0.4,
+            ..Counts::default()
+        };
+        let likely = Evidence {
+            b_on_a: counts(2400, 0),
+            a_on_b: counts(2400, 0),
+            consensus: 72.0,
+            match_inliers: 120,
+            matches: 300,
+            range_images: 2,
+            ..Evidence::default()
+        };
+        let both = counts(300, 2000);
+        let bad = Detail { b_on_a: both, a_on_b: both, stands_for: [1; 2], ..Detail::default() };
+        let gain = |of: &Verifier, evidence: &Evidence| {
+            let closely = Evidence { detail: Some(bad), ..*evidence };
+            of.pair_logit(&closely, 0.05) - of.pair_logit(evidence, 0.05)
+        };
+        assert!(gain(&shipped, &likely) < -2.0, "{}", gain(&shipped, &likely));
+        let unlikely = Evidence { b_on_a: both, a_on_b: both, match_inliers: 3, consensus: 2.0, ..likely };
+        assert!(shipped.pair_logit(&unlikely, 0.05) < CLOSELY);
+        assert_eq!(gain(&shipped, &unlikely), 0.0);
+        let without = Verifier { detail: None, ..Verifier::clone(&shipped) };
+        assert_eq!(gain(&without, &likely), 0.0);
+        let mut other = Verifier::clone(&shipped);
+        other.detail.as_mut().unwrap().weights.pop();
+        let error = Verifier::parse(&serde_json::to_string(&other).unwrap()).unwrap_err();
+        assert!(error.to_string().starts_with("the detail regression does not take 15"), "{error}");
     }
 
     #[test]
@@ -309,6 +372,7 @@ mod tests {
             matches: 300,
             range_images: 2,
             appearance: None,
+            detail: None,
         };
         let logit = |e: Evidence| shipped_verifier().pair.logit(&e.features(0.05));
         assert!(logit(evidence(good, 120)) > 2.0);

@@ -240,6 +240,7 @@ fn verifier(scenes: &[MatchedScene], kept: &[usize], fit: &Fit, command: &str) -
         provenance,
         pair: fit.pair.clone(),
         triplet: fit.triplet.clone(),
+        detail: fit.detail.clone(),
         appearance: fit.appearance.clone(),
     }
 }
