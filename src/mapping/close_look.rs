@@ -155,7 +155,7 @@ fn looseness(
     let mut own = words.iter().filter(|word| word.proposal.has_own_voice());
     let (word, None) = (own.next()?, own.next()) else { return None };
     let Evidence { b_on_a, a_on_b, .. } = said_here(graph, word, options)?;
-    (b_on_a.overlap().max(a_on_b.overlap()) < LEAST_HOLD)
+    (b_on_a.plus(a_on_b).points >= LEAST_JUDGED && b_on_a.overlap().max(a_on_b.overlap()) < LEAST_HOLD)
         .then_some(Refusal::Support { found: support, needed: options.most_support() })
 }
 
