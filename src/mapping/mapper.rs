@@ -2,9 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::bent_join::bent_join;
+use super::bent_join::{Joined, weigh_even_bent};
 use super::candidates::{CLUSTERS, Candidate, candidates};
-use super::close_look::FEW;
 use super::component::Component;
 use super::guarded::{guarded, refined};
 use super::initial_pair::initial_pairs;
@@ -101,9 +100,23 @@ impl Mapper {
             if self.refused.still_holds(link, next.support, level) {
                 continue;
             }
-            match weigh_join(graph, (component, &single), &next.candidates, level, voxel, options, control)? {
-                Ok(a_from_b) => {
+            match weigh_even_bent(
+                graph,
+                (component, &single),
+                &next.candidates,
+                level,
+                voxel,
+                options,
+                control,
+            )? {
+                Ok(Joined::Rigid(a_from_b)) => {
                     self.take_in((next.component, single), &a_from_b, graph, voxel, options, control)?;
+                    return Ok(Some(next.scan));
+                }
+                Ok(Joined::Bent(joined)) => {
+                    self.components[next.component] = joined;
+                    self.waiting.remove(&next.scan);
+                    self.joins_since_refinement += 1;
                     return Ok(Some(next.scan));
                 }
                 Err(refusal) => {
@@ -261,25 +274,20 @@ impl Mapper {
                 continue;
             }
             let (first, second) = (&self.components[a], &self.components[b]);
-            match weigh_join(graph, (first, second), &candidates, level, voxel, options, control)? {
-                Ok(a_from_b) => {
-                    let other = self.components[b].clone();
-                    self.components[a].absorb(other, &a_from_b, graph, options);
+            match weigh_even_bent(graph, (first, second), &candidates, level, voxel, options, control)? {
+                Ok(joined) => {
+                    match joined {
+                        Joined::Rigid(a_from_b) => {
+                            let other = self.components[b].clone();
+                            self.components[a].absorb(other, &a_from_b, graph, options);
+                        }
+                        Joined::Bent(joined) => self.components[a] = joined,
+                    }
                     self.components.remove(b);
                     self.joins_since_refinement += 1;
                     return Ok(true);
                 }
                 Err(refusal) => {
-                    if let Refusal::Violation { .. } = refusal
-                        && candidate.members.len() > FEW
-                        && let Some(joined) =
-                            bent_join(graph, (first, second), candidate, level, voxel, options, control)?
-                    {
-                        self.components[a] = joined;
-                        self.components.remove(b);
-                        self.joins_since_refinement += 1;
-                        return Ok(true);
-                    }
                     let (support, needed) = (candidate.support, level.support);
                     self.refused.insert(link, Refused { support, needed, refusal });
                 }
@@ -288,7 +296,7 @@ impl Mapper {
         Ok(false)
     }
 
-    /// Refines every component, then its tracks at the new poses.
+    /// Completes the tracks of every component, refines it, and filters its tracks at the new poses.
     pub fn refine(
         &mut self,
         graph: &ScanGraph,
@@ -297,6 +305,8 @@ impl Mapper {
         control: Control<'_>,
     ) -> Result<(), Cancelled> {
         for component in &mut self.components {
+            // What was too far from its landmark when it was seen first may be near now.
+            component.complete_tracks(graph, options);
             *component = refined(graph, component, voxel, options, control)?;
             component.tracks.filter(&component.poses, options.track_voxels * voxel, options.track_length);
         }

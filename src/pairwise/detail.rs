@@ -5,7 +5,7 @@ use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
 use super::dense::{Counts, look, look_through, share};
-use super::distinct::{SharedPoint, beyond_largest_planes, evenly, shared_in};
+use super::distinct::{SharedPoints, beyond_largest_planes};
 use super::icp::icp;
 use crate::features::Scan;
 use crate::geometry::Pose;
@@ -88,10 +88,10 @@ pub fn detail(a: &Scan, b: &Scan, a_from_b: &Pose) -> Option<Detail> {
 fn between(a: &Scan, b: &Scan, a_from_b: &Pose) -> Detail {
     let stride = |scan: &Scan| scan.prepared.points.len().div_ceil(POINTS).max(1);
     let (of_a, of_b) = (stride(a), stride(b));
-    let mut shared = Vec::new();
-    let b_on_a = look_through(a, b, a_from_b, of_b, |block| shared_in(block, a, &mut shared));
+    let mut shared = SharedPoints::default();
+    let b_on_a = look_through(a, b, a_from_b, of_b, |block| shared.extend(block, a));
     let a_on_b = look(b, a, &a_from_b.inverse(), of_a);
-    let shared = evenly(&shared, SHARED_POINTS);
+    let shared = shared.evenly(SHARED_POINTS);
     let facing = facing(&shared);
     let points = shared.len().max(1) as f32;
     let beyond_planes =
@@ -100,8 +100,8 @@ fn between(a: &Scan, b: &Scan, a_from_b: &Pose) -> Detail {
 }
 
 /// See [`Detail::facing`].
-fn facing(shared: &[SharedPoint]) -> [f32; 2] {
-    let sum: Matrix3<f32> = shared.iter().map(|one| one.normal * one.normal.transpose()).sum();
+fn facing(shared: &SharedPoints) -> [f32; 2] {
+    let sum: Matrix3<f32> = shared.normals().map(|normal| normal * normal.transpose()).sum();
     let mut squares: [f32; 3] = (sum / sum.trace().max(1.0)).symmetric_eigenvalues().into();
     squares.sort_by(f32::total_cmp);
     [squares[0].max(0.0), squares[1].max(0.0)]

@@ -1,6 +1,7 @@
 //! What of the surfaces that two scans share tells their place from others. The corner of one room fits the corner of any other: three planes hold
 //! a pose firmly, and say little of where it is. What coincides beyond the three largest planes says that.
 
+use multiversion::multiversion;
 use nalgebra::Vector3;
 
 use super::contacts::{Contacts, Motion};
@@ -46,56 +47,91 @@ impl Coinciding {
     }
 }
 
-/// A point of both scans and its normal, metres, frame of a.
-#[derive(Clone, Copy)]
-pub(super) struct SharedPoint {
-    pub point: Vector3<f32>,
-    pub normal: Vector3<f32>,
+/// Points of both scans, metres, and their normals, frame of a: one array a coordinate, so that planes are tried on many at once.
+#[derive(Default)]
+pub(super) struct SharedPoints {
+    point: [Vec<f32>; 3],
+    normal: [Vec<f32>; 3],
+}
+
+impl SharedPoints {
+    pub(super) fn len(&self) -> usize {
+        self.normal[0].len()
+    }
+
+    fn at(&self, index: usize) -> (Vector3<f32>, Vector3<f32>) {
+        let of = |axes: &[Vec<f32>; 3]| Vector3::from_fn(|k, _| axes[k][index]);
+        (of(&self.point), of(&self.normal))
+    }
+
+    fn push(&mut self, point: [f32; 3], normal: [f32; 3]) {
+        for k in 0..3 {
+            self.point[k].push(point[k]);
+            self.normal[k].push(normal[k]);
+        }
+    }
+
+    /// Adds the points of a that those of a block coincide with, one for each of these.
+    pub(super) fn extend(&mut self, block: &Contacts, a: &Scan) {
+        let reach = NEAR_VOXELS * a.prepared.resolution as f32;
+        for i in 0..block.len {
+            if block.square[i] < reach * reach && block.agreement(i) > SAME_SURFACE {
+                let met = &a.surfels[block.near(i)];
+                self.push(met.position, met.normal);
+            }
+        }
+    }
+
+    /// At most so many of them, evenly spread.
+    #[must_use]
+    pub(super) fn evenly(&self, most: usize) -> Self {
+        let step = self.len().div_ceil(most).max(1);
+        let of =
+            |axes: &[Vec<f32>; 3]| axes.each_ref().map(|axis| axis.iter().step_by(step).copied().collect());
+        Self { point: of(&self.point), normal: of(&self.normal) }
+    }
+
+    pub(super) fn normals(&self) -> impl Iterator<Item = Vector3<f32>> + '_ {
+        (0..self.len()).map(|index| self.at(index).1)
+    }
+
+    fn keep(&mut self, kept: &[bool]) {
+        for axis in self.point.iter_mut().chain(&mut self.normal) {
+            let mut of_each = kept.iter();
+            axis.retain(|_| of_each.next().is_some_and(|kept| *kept));
+        }
+    }
 }
 
 /// What of two scans coincides at a pose (b to a, local frames).
 #[must_use]
 pub fn coinciding(a: &Scan, b: &Scan, a_from_b: &Pose) -> Coinciding {
     let motion = Motion::of(a_from_b);
-    let (mut block, mut first, mut shared) = (Contacts::new(), 0, Vec::new());
+    let (mut block, mut first, mut shared) = (Contacts::new(), 0, SharedPoints::default());
     while let Some(next) = block.fill(a, b, &motion, first, 1) {
         first = next;
-        shared_in(&block, a, &mut shared);
+        shared.extend(&block, a);
     }
-    let looked_at = evenly(&shared, POINTS);
+    let looked_at = shared.evenly(POINTS);
     let points = looked_at.len() as u32;
     let [beyond_planes] = beyond_largest_planes(looked_at, a.prepared.resolution, [PLANES]);
     Coinciding { points, beyond_planes }
 }
 
-/// Adds the points of a that those of a block coincide with, one for each of these.
-pub(super) fn shared_in(block: &Contacts, a: &Scan, shared: &mut Vec<SharedPoint>) {
-    let reach = NEAR_VOXELS * a.prepared.resolution as f32;
-    for i in 0..block.len {
-        if block.square[i] < reach * reach && block.agreement(i) > SAME_SURFACE {
-            let met = &a.surfels[block.near(i)];
-            shared.push(SharedPoint { point: met.position.into(), normal: met.normal.into() });
-        }
-    }
-}
-
-/// At most so many of them, evenly spread.
-pub(super) fn evenly(shared: &[SharedPoint], most: usize) -> Vec<SharedPoint> {
-    shared.iter().step_by(shared.len().div_ceil(most).max(1)).copied().collect()
-}
-
 /// How many of them lie on none of the largest planes, after so many of these (ascending) are taken away; `voxel` in metres.
 pub(super) fn beyond_largest_planes<const N: usize>(
-    mut left: Vec<SharedPoint>,
+    mut left: SharedPoints,
     voxel: f64,
     planes: [usize; N],
 ) -> [u32; N] {
     let thickness = THICKNESS_VOXELS * voxel as f32;
-    let mut taken = 0;
+    let (mut taken, mut held) = (0, Vec::new());
     planes.map(|planes| {
         for _ in taken..planes {
-            let Some(plane) = largest_plane(&left, thickness) else { break };
-            left.retain(|one| !plane.holds(one));
+            let Some(plane) = largest_plane(&left, thickness, &mut held) else { break };
+            hold(&plane, &left, &mut held);
+            held.iter_mut().for_each(|held| *held = !*held);
+            left.keep(&held);
         }
         taken = planes;
         left.len() as u32
@@ -103,47 +139,68 @@ pub(super) fn beyond_largest_planes<const N: usize>(
 }
 
 /// A plane of some thickness, seen from one side.
+#[derive(Clone, Copy)]
 struct Plane {
-    at: SharedPoint,
+    /// A point of it, metres.
+    point: Vector3<f32>,
+    normal: Vector3<f32>,
     /// Metres to either side.
     thickness: f32,
 }
 
 impl Plane {
-    fn holds(&self, shared: &SharedPoint) -> bool {
-        let SharedPoint { point, normal } = &self.at;
-        normal.dot(&shared.normal) > SAME_PLANE && normal.dot(&(shared.point - point)).abs() < self.thickness
-    }
-
-    /// The same through the middle of its points, across the mean of their normals.
-    fn settled(&self, shared: &[SharedPoint]) -> Self {
+    /// The same through the middle of the points that it holds, across the mean of their normals.
+    fn settled(&self, shared: &SharedPoints, held: &[bool]) -> Self {
         let (mut point, mut normal, mut count) = (Vector3::zeros(), Vector3::zeros(), 0.0_f32);
-        for one in shared.iter().filter(|one| self.holds(one)) {
-            point += one.point;
-            normal += one.normal;
+        for index in (0..shared.len()).filter(|index| held[*index]) {
+            let one = shared.at(index);
+            point += one.0;
+            normal += one.1;
             count += 1.0;
         }
-        let at = match normal.try_normalize(f32::MIN_POSITIVE) {
-            Some(normal) => SharedPoint { point: point / count, normal },
-            None => self.at,
-        };
-        Self { at, ..*self }
+        match normal.try_normalize(f32::MIN_POSITIVE) {
+            Some(normal) => Self { point: point / count, normal, ..*self },
+            None => *self,
+        }
     }
 }
 
-/// The plane that holds most points.
-fn largest_plane(shared: &[SharedPoint], thickness: f32) -> Option<Plane> {
+/// Which points a plane holds; gives their number.
+#[multiversion(targets("x86_64+avx512f+avx512dq+avx512bw+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn hold(plane: &Plane, shared: &SharedPoints, held: &mut Vec<bool>) -> u32 {
+    held.clear();
+    held.resize(shared.len(), false);
+    let n = held.len();
+    let [x, y, z] = shared.point.each_ref().map(|axis| &axis[..n]);
+    let [nx, ny, nz] = shared.normal.each_ref().map(|axis| &axis[..n]);
+    let Plane { point, normal, thickness } = *plane;
+    let mut count = 0;
+    for i in 0..n {
+        let agreement = normal.x * nx[i] + normal.y * ny[i] + normal.z * nz[i];
+        let apart = normal.x * (x[i] - point.x) + normal.y * (y[i] - point.y) + normal.z * (z[i] - point.z);
+        held[i] = (agreement > SAME_PLANE) & (apart.abs() < thickness);
+        count += u32::from(held[i]);
+    }
+    count
+}
+
+/// The plane that holds most points. `held` is for the work.
+fn largest_plane(shared: &SharedPoints, thickness: f32, held: &mut Vec<bool>) -> Option<Plane> {
     let step = shared.len().div_ceil(TRIED).max(1);
-    let count = |plane: &Plane| shared.iter().filter(|one| plane.holds(one)).count();
-    let tried = shared.iter().step_by(step).map(|at| Plane { at: *at, thickness });
     let (mut best, mut most) = (None, 0);
-    for plane in tried {
-        let held = count(&plane);
-        if held > most {
-            (best, most) = (Some(plane), held);
+    for index in (0..shared.len()).step_by(step) {
+        let (point, normal) = shared.at(index);
+        let plane = Plane { point, normal, thickness };
+        let count = hold(&plane, shared, held);
+        if count > most {
+            (best, most) = (Some(plane), count);
         }
     }
-    (0..ROUNDS).fold(best, |plane, _| plane.map(|plane| plane.settled(shared)))
+    (0..ROUNDS).fold(best, |plane, _| {
+        let plane = plane?;
+        hold(&plane, shared, held);
+        Some(plane.settled(shared, held))
+    })
 }
 
 #[cfg(test)]
