@@ -15,9 +15,9 @@ use crate::features::Scan;
 use crate::geometry::Pose;
 use crate::pairwise::{Hypothesis, PairKey, PairResult, Probe, match_pair, probe};
 
-/// Pairs that are matched before the memory that their close looks took is given back.
+/// Pairs that are matched before the memory that their close looks took is given back, if it is much.
 const BLOCK: usize = 512;
-/// Scans whose finer surfaces stay in memory while joins are weighed, at most.
+/// Scans whose finer surfaces stay in memory from one block of pairs, or one join that is weighed, to the next, at most.
 const UNPACKED: usize = 64;
 
 /// A hypothesis with what third scans say of it.
@@ -190,8 +190,14 @@ impl ScanGraph {
                     Ok(result)
                 })
                 .collect();
-            self.forget_fine();
-            results.extend(matched?);
+            match matched {
+                Ok(matched) => results.extend(matched),
+                Err(cancelled) => {
+                    self.forget_fine();
+                    return Err(cancelled);
+                }
+            }
+            self.forget_fine_of_many();
         }
         drop(matching);
         let _supporting = control.begin(Stage::Support);

@@ -9,9 +9,7 @@ use crate::features::Scan;
 use crate::geometry::Pose;
 use crate::graph::ScanGraph;
 use crate::optimize::{Correspondence, Correspondences};
-use crate::pairwise::{
-    Contacts, Counts, Motion, PairKey, look, look_leniently, perturbed_about, quick_overlap,
-};
+use crate::pairwise::{Counts, Motion, PairKey, look, look_leniently, meet, perturbed_about, quick_overlap};
 
 /// Cosine by which normals of corresponding points agree at least.
 const MIN_NORMAL_DOT: f32 = 0.5;
@@ -51,8 +49,7 @@ pub fn associate(
     let motion = Motion::of(i_from_j);
     let square_gate = (gate as f32).powi(2);
     let mut found = Vec::with_capacity(j.prepared.points.len() / stride);
-    let (mut block, mut first) = (Contacts::new(), offset);
-    while let Some(next) = block.fill(i, j, &motion, first, stride) {
+    meet(i, j, &motion, (offset, stride), |block, first| {
         for k in 0..block.len {
             if block.square[k] < square_gate && block.agreement(k) > MIN_NORMAL_DOT {
                 let near = block.near(k);
@@ -64,8 +61,7 @@ pub fn associate(
                 });
             }
         }
-        first = next;
-    }
+    });
     found
 }
 

@@ -135,7 +135,7 @@ impl Mapper {
                 None => self.components.push(component),
             }
         }
-        graph.forget_fine();
+        graph.forget_fine_of_many();
         self.dissolve_small();
         self.sort_components();
         Ok(bans)

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::contacts::{Contacts, Motion};
+use super::contacts::{Motion, meet};
 use super::dense::{NEAR_VOXELS, NORMAL_DOT};
 use crate::features::Scan;
 use crate::geometry::Pose;
@@ -39,8 +39,7 @@ pub fn appearance(a: &Scan, b: &Scan, a_from_b: &Pose) -> Option<Appearance> {
     let stride = (b.prepared.points.len() / POINTS).max(1);
     let motion = Motion::of(a_from_b);
     let (mut of_a, mut of_b) = (Vec::new(), Vec::new());
-    let (mut block, mut first) = (Contacts::new(), 0);
-    while let Some(next) = block.fill(a, b, &motion, first, stride) {
+    meet(a, b, &motion, (0, stride), |block, first| {
         for i in 0..block.len {
             if block.square[i] < near
                 && block.agreement(i) > NORMAL_DOT
@@ -50,8 +49,7 @@ pub fn appearance(a: &Scan, b: &Scan, a_from_b: &Pose) -> Option<Appearance> {
                 of_b.push(y.map(f32::from));
             }
         }
-        first = next;
-    }
+    });
     if of_a.len() < LEAST_CONTACTS {
         return None;
     }

@@ -3,6 +3,8 @@
 //! Points go through in blocks, one array a coordinate, so that the arithmetic runs on many at once and the lookups between, which wait
 //! for memory, do not wait for each other.
 
+use std::cell::Cell;
+
 use multiversion::multiversion;
 
 use crate::features::Scan;
@@ -50,11 +52,34 @@ pub(crate) struct Contacts {
     /// Square of its length; infinite where nothing is near.
     pub square: Numbers,
     found: [u32; BLOCK],
+    apart: [Numbers; 3],
+}
+
+thread_local! {
+    /// A block that nobody uses: a new one is more work than a look at a few points.
+    static SPARE: Cell<Option<Box<Contacts>>> = const { Cell::new(None) };
+}
+
+/// Carries the points of `other`, every `stride`-th from `first`, into the frame of `scan`, and shows them block after block, each with the number of its
+/// first point.
+pub(crate) fn meet(
+    scan: &Scan,
+    other: &Scan,
+    motion: &Motion,
+    (first, stride): (usize, usize),
+    mut show: impl FnMut(&mut Contacts, usize),
+) {
+    let mut block = SPARE.take().unwrap_or_else(|| Box::new(Contacts::new()));
+    let mut at = first;
+    while let Some(next) = block.fill(scan, other, motion, at, stride) {
+        show(&mut block, at);
+        at = next;
+    }
+    SPARE.set(Some(block));
 }
 
 impl Contacts {
-    /// An empty block.
-    pub fn new() -> Self {
+    fn new() -> Self {
         const NONE: [Numbers; 3] = [[0.0; BLOCK]; 3];
         Self {
             len: 0,
@@ -64,7 +89,20 @@ impl Contacts {
             offset: NONE,
             square: [f32::INFINITY; BLOCK],
             found: [0; BLOCK],
+            apart: NONE,
         }
+    }
+
+    /// The points that are not as near to what they meet as this, square metres; one array a coordinate.
+    pub fn farther_than(&mut self, square: f32) -> [&[f32]; 3] {
+        let mut len = 0;
+        for i in 0..self.len {
+            for k in 0..3 {
+                self.apart[k][len] = self.point[k][i];
+            }
+            len += usize::from(self.square[i] >= square);
+        }
+        self.apart.each_ref().map(|axis| &axis[..len])
     }
 
     /// Which point of the scan a point of the block meets; of meaning only where `square` is finite.
@@ -84,7 +122,7 @@ impl Contacts {
 
     /// Fills the block with the next points of `other`, every `stride`-th from `first`, at most [`BLOCK`], and gives the first
     /// that has to follow; `None` when there are no more.
-    pub fn fill(
+    fn fill(
         &mut self,
         scan: &Scan,
         other: &Scan,

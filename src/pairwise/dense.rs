@@ -4,7 +4,7 @@
 use multiversion::multiversion;
 use serde::{Deserialize, Serialize};
 
-use super::contacts::{BLOCK, Contacts, LANES, Motion};
+use super::contacts::{Contacts, LANES, Motion, meet};
 use crate::features::Scan;
 use crate::geometry::Pose;
 
@@ -103,25 +103,16 @@ pub(super) fn look_through(
     let near = Near::at(scan.prepared.resolution as f32);
     let motion = Motion::of(scan_from_other);
     let mut counts = Counts::default();
-    let (mut block, mut first) = (Contacts::new(), 0);
-    let mut elsewhere = [[0.0; BLOCK]; 3];
-    while let Some(next) = block.fill(scan, other, &motion, first, stride.max(1)) {
-        first = next;
-        counts = counts.plus(&on_surface(&block, &near));
-        show(&block);
-        let Some(image) = &scan.prepared.range_image else { continue };
-        // So near a surface nothing can be clearly in front of it: only the other points are judged.
-        let mut len = 0;
-        for i in 0..block.len {
-            for k in 0..3 {
-                elsewhere[k][len] = block.point[k][i];
-            }
-            len += usize::from(block.square[i] >= near.square);
+    meet(scan, other, &motion, (0, stride.max(1)), |block, _| {
+        counts = counts.plus(&on_surface(block, &near));
+        show(block);
+        if let Some(image) = &scan.prepared.range_image {
+            // So near a surface nothing can be clearly in front of it: only the other points are judged.
+            let (violations, on_seen_surface) = image.judge_all(block.farther_than(near.square));
+            counts.violations += violations;
+            counts.on_seen_surface += on_seen_surface;
         }
-        let (violations, on_seen_surface) = image.judge_all(elsewhere.each_ref().map(|axis| &axis[..len]));
-        counts.violations += violations;
-        counts.on_seen_surface += on_seen_surface;
-    }
+    });
     counts
 }
 
@@ -130,11 +121,8 @@ pub(super) fn look_through(
 pub fn quick_overlap(scan: &Scan, other: &Scan, scan_from_other: &Pose, stride: usize) -> usize {
     let near = Near::at(scan.prepared.resolution as f32);
     let motion = Motion::of(scan_from_other);
-    let (mut block, mut first, mut inliers) = (Contacts::new(), 0, 0);
-    while let Some(next) = block.fill(scan, other, &motion, first, stride.max(1)) {
-        first = next;
-        inliers += on_surface(&block, &near).inliers;
-    }
+    let mut inliers = 0;
+    meet(scan, other, &motion, (0, stride.max(1)), |block, _| inliers += on_surface(block, &near).inliers);
     inliers as usize
 }
 

@@ -4,7 +4,7 @@
 use multiversion::multiversion;
 use nalgebra::Vector3;
 
-use super::contacts::{Contacts, Motion};
+use super::contacts::{Contacts, Motion, meet};
 use crate::features::Scan;
 use crate::geometry::Pose;
 
@@ -107,11 +107,8 @@ impl SharedPoints {
 #[must_use]
 pub fn coinciding(a: &Scan, b: &Scan, a_from_b: &Pose) -> Coinciding {
     let motion = Motion::of(a_from_b);
-    let (mut block, mut first, mut shared) = (Contacts::new(), 0, SharedPoints::default());
-    while let Some(next) = block.fill(a, b, &motion, first, 1) {
-        first = next;
-        shared.extend(&block, a);
-    }
+    let mut shared = SharedPoints::default();
+    meet(a, b, &motion, (0, 1), |block, _| shared.extend(block, a));
     let looked_at = shared.evenly(POINTS);
     let points = looked_at.len() as u32;
     let [beyond_planes] = beyond_largest_planes(looked_at, a.prepared.resolution, [PLANES]);

@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 use nalgebra::{Matrix6, Vector3, Vector6};
 
-use super::contacts::{Contacts, LANES, Motion, Numbers};
+use super::contacts::{Contacts, LANES, Motion, Numbers, meet};
 use crate::features::Scan;
 use crate::geometry::Pose;
 
@@ -63,11 +63,7 @@ fn normal_equations(
     let about = pose.transform(&b.centroid).cast::<f32>();
     let limits = Limits { about: about.into(), gate_square: gate * gate, per_kernel: 1.0 / kernel };
     let mut sums = [0.0_f64; SUMS];
-    let (mut block, mut first) = (Contacts::new(), 0);
-    while let Some(next) = block.fill(a, b, &motion, first, stride) {
-        first = next;
-        accumulate(&block, &limits, &mut sums);
-    }
+    meet(a, b, &motion, (0, stride), |block, _| accumulate(block, &limits, &mut sums));
     let [count, x, y, z, rest @ ..] = sums;
     if count < 12.0 {
         return None;

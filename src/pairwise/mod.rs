@@ -21,7 +21,7 @@ mod verifier;
 
 pub use appearance::{Appearance, appearance};
 pub use consensus::{Consensus, ConsensusOptions, INLIER_VOXELS, agreement, centred_difference, consensus};
-pub(crate) use contacts::{Contacts, Motion};
+pub(crate) use contacts::{Motion, meet};
 pub use dense::{Counts, look, quick_overlap};
 pub use detail::{DETAIL_FEATURES, Detail, detail};
 pub use distinct::{Coinciding, coinciding};
