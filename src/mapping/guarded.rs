@@ -8,7 +8,11 @@ use super::surfaces::judge_inside;
 use crate::control::{Cancelled, Control};
 use crate::graph::ScanGraph;
 
-/// A component after the pose graph and the joint dense adjustment; where these leave more in free space than there was, after the dense
+/// More in free space than there was, by this factor, is noticed. Where nothing bends it comes to 0.98 to 1.03 times as much, and a second dense adjustment
+/// would double what a refinement takes; bends show by 1.3 times and more.
+const NOTICEABLE: f64 = 1.1;
+
+/// A component after the pose graph and the joint dense adjustment; where these leave noticeably more in free space than there was, after the dense
 /// adjustment alone if that leaves less: edges of little overlap all slide the same way, and a pose graph of such edges bends what was straight.
 pub fn refined(
     graph: &ScanGraph,
@@ -30,7 +34,7 @@ pub fn refined(
     })?;
     let spread = on_surfaces(spread)?;
     let bent = violation(&spread);
-    if bent <= violation(component) {
+    if bent <= NOTICEABLE * violation(component) {
         return Ok(spread);
     }
     let alone = on_surfaces(component.clone())?;

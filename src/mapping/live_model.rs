@@ -157,7 +157,7 @@ impl LiveModel {
     /// Joint dense refinement over all overlapping pairs.
     pub fn dense_refinement(&mut self, control: Control<'_>) -> Result<RefinementReport, Cancelled> {
         self.improve(Stage::DenseRefinement, control, |graph, component, voxel, _| {
-            Ok(dense(graph, component, None, Reach::NEAR, voxel, control)?.and_then(|outcome| outcome.last))
+            dense(graph, component, None, Reach::NEAR, voxel, control)
         })
     }
 

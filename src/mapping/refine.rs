@@ -241,21 +241,8 @@ pub fn pose_graph(
     Ok(())
 }
 
-/// What a dense adjustment did, measured on points that it did not use.
-#[derive(Debug, Clone, PartialEq)]
-pub struct DenseOutcome {
-    /// Held-out RMS before, metres.
-    pub before: f64,
-    /// Held-out RMS after, metres.
-    pub after: f64,
-    /// Rounds of association.
-    pub rounds: usize,
-    /// How the last round ended.
-    pub last: Option<Report>,
-}
-
 /// Joint dense adjustment of all overlapping pairs and the landmarks. With `free`, only those scans move and only
-/// their pairs count. `None` when nothing overlaps.
+/// their pairs count. How the last round ended; `None` when nothing overlaps.
 pub fn dense(
     graph: &ScanGraph,
     component: &mut Component,
@@ -263,7 +250,7 @@ pub fn dense(
     reach: Reach,
     voxel: f64,
     control: Control<'_>,
-) -> Result<Option<DenseOutcome>, Cancelled> {
+) -> Result<Option<Report>, Cancelled> {
     let _adjusting = control.begin(Stage::DenseRefinement);
     let indexed = Indexed::new(component);
     let is_free = |key: &ScanKey| free.is_none_or(|free| free.contains(key));
@@ -271,21 +258,18 @@ pub fn dense(
     let gauge = component.gauge;
     let held = indexed.held_but(|key| *key != gauge && is_free(key));
     let tracks = indexed.tracks(component, |observations| observations.iter().any(|o| is_free(&o.scan)));
-    let gate = HELD_OUT_GATE_VOXELS * voxel;
-    let before = surfaces.held_out_rms(&indexed.poses, gate);
+    let surface_rms = surfaces.held_out_rms(&indexed.poses, HELD_OUT_GATE_VOXELS * voxel);
     let seen = component.tracks.iter().map(|landmark| landmark.observations.as_slice());
     let seen = seen.filter(|observations| observations.iter().any(|o| is_free(&o.scan)));
     let settings = DenseOptions {
-        landmark_weight: landmark_weight(seen, &component.poses, before),
+        landmark_weight: landmark_weight(seen, &component.poses, surface_rms),
         ..DenseOptions::with_gates(reach.first_gate_voxels * voxel, LAST_GATE_VOXELS * voxel)
     };
     let problem = DenseProblem { poses: &indexed.poses, held: &held, surfaces: &surfaces, tracks: &tracks };
     match adjust_dense(&problem, &settings, control) {
         Ok(adjusted) => {
-            let after = surfaces.held_out_rms(&adjusted.poses, gate);
             write_back(component, &indexed.keys, &adjusted.poses);
-            let last = adjusted.rounds.last().map(|round| round.report);
-            Ok(Some(DenseOutcome { before, after, rounds: adjusted.rounds.len(), last }))
+            Ok(adjusted.rounds.last().map(|round| round.report))
         }
         Err(DenseError::Minimise(MinimiseError::Cancelled(cancelled))) => Err(cancelled),
         Err(_) => Ok(None),
