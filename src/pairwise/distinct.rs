@@ -127,7 +127,9 @@ pub(super) fn beyond_largest_planes<const N: usize>(
         for _ in taken..planes {
             let Some(plane) = largest_plane(&left, thickness, &mut held) else { break };
             hold(&plane, &left, &mut held);
-            held.iter_mut().for_each(|held| *held = !*held);
+            for held in &mut held {
+                *held = !*held;
+            }
             left.keep(&held);
         }
         taken = planes;
