@@ -164,7 +164,8 @@ impl ScanGraph {
     }
 
     /// Matches and verifies the pairs that were not tried yet, in parallel, adds them as edges and renews the support of every
-    /// hypothesis that they touch. Returns the new results in ascending order. On `Err` the graph is unchanged.
+    /// hypothesis that they touch. Returns the new results in ascending order. On `Err` the graph is unchanged. Finer surfaces of few scans stay in
+    /// memory, until [`ScanGraph::forget_fine`].
     pub fn try_pairs(
         &mut self,
         pairs: &BTreeSet<PairKey>,

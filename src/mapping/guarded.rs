@@ -10,7 +10,7 @@ use crate::graph::ScanGraph;
 
 /// More in free space than there was, by this factor, is noticed. Where nothing bends it comes to 0.98 to 1.03 times as much, and a second dense adjustment
 /// would double what a refinement takes; bends show by 1.3 times and more.
-const NOTICEABLE: f64 = 1.1;
+const NOTICEABLE: f64 = 1.05;
 
 /// A component after the pose graph and the joint dense adjustment; where these leave noticeably more in free space than there was, after the dense
 /// adjustment alone if that leaves less: edges of little overlap all slide the same way, and a pose graph of such edges bends what was straight.

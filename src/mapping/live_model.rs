@@ -105,7 +105,12 @@ impl LiveModel {
         }
         let pairs = retrieve(&Retrieval::new(&next.graph), fresh, next.options.retrieved, control)?;
         next.try_pairs(&pairs, control)?;
-        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options, control)?;
+        let loosened = next.mapper.loosen(&next.graph, next.options.firm_support, &next.options, control);
+        if loosened.is_err() {
+            // The scans are shared with this model, and what matching unpacked of them would stay.
+            next.graph.forget_fine();
+        }
+        loosened?;
         next.grow(control)?;
         *self = next;
         Ok(())

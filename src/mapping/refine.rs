@@ -242,7 +242,7 @@ pub fn pose_graph(
 }
 
 /// Joint dense adjustment of all overlapping pairs and the landmarks. With `free`, only those scans move and only
-/// their pairs count. How the last round ended; `None` when nothing overlaps.
+/// their pairs count. How the last round ended; `None` when nothing overlaps or the adjustment fails, and the poses stay.
 pub fn dense(
     graph: &ScanGraph,
     component: &mut Component,

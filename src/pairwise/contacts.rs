@@ -144,6 +144,12 @@ impl Contacts {
             return None;
         }
         let (used, lanes) = (self.len, self.lanes());
+        // Nothing of an earlier scan is left where the arithmetic goes.
+        for axis in
+            [&mut self.point, &mut self.normal, &mut self.surface, &mut self.offset].into_iter().flatten()
+        {
+            axis[used..lanes].fill(0.0);
+        }
         carry(&mut self.point, &mut self.normal, motion, lanes);
         let [x, y, z] = &self.point;
         scan.grid.nearest_of_all([&x[..used], &y[..used], &z[..used]], &mut self.found[..used]);

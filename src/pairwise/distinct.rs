@@ -152,9 +152,9 @@ impl Plane {
     fn settled(&self, shared: &SharedPoints, held: &[bool]) -> Self {
         let (mut point, mut normal, mut count) = (Vector3::zeros(), Vector3::zeros(), 0.0_f32);
         for index in (0..shared.len()).filter(|index| held[*index]) {
-            let one = shared.at(index);
-            point += one.0;
-            normal += one.1;
+            let (at, facing) = shared.at(index);
+            point += at;
+            normal += facing;
             count += 1.0;
         }
         match normal.try_normalize(f32::MIN_POSITIVE) {
