@@ -327,3 +327,73 @@ impl ScanGraph {
 fn in_steps(correction: f64) -> f64 {
     (correction / STEP).round() * STEP
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::control::{CancelToken, Observer, Progress, Silent};
+    use crate::features::PreparedScan;
+    use crate::pairwise::test_survey::hall;
+
+    /// Cancels once anything is done.
+    struct Impatient(CancelToken);
+
+    impl Observer for Impatient {
+        fn progress(&self, progress: Progress) {
+            if progress.done > 0 {
+                self.0.cancel();
+            }
+        }
+    }
+
+    /// A hall of three scans, and all its pairs.
+    fn three() -> (ScanGraph, BTreeSet<PairKey>) {
+        let mut graph = ScanGraph::new();
+        for (scan, _) in hall(3).scans {
+            graph.add_scan(Arc::new(scan));
+        }
+        let pair = |a, b| PairKey::of(ScanKey(a), ScanKey(b));
+        (graph, [pair(1, 2), pair(1, 3), pair(2, 3)].into())
+    }
+
+    fn unpacked(graph: &ScanGraph) -> usize {
+        graph.scans.values().filter(|scan| scan.is_unpacked()).count()
+    }
+
+    #[test]
+    fn finer_surfaces_stay_after_matching_and_go_when_it_is_cancelled() {
+        let (mut graph, pairs) = three();
+        let options = SupportOptions::default();
+        let token = CancelToken::new();
+        let impatient = Impatient(token.clone());
+        let control = Control { cancel: &token, observer: &impatient };
+        assert!(graph.try_pairs(&pairs, &options, control).is_err());
+        assert_eq!((unpacked(&graph), graph.edges().count()), (0, 0));
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let found = graph.try_pairs(&pairs, &options, control).expect("nobody cancels");
+        assert_eq!((unpacked(&graph), found.len()), (3, 3), "all are likely, so all are looked at closely");
+        graph.forget_fine_of_many();
+        assert_eq!(unpacked(&graph), 3, "three are not many");
+        graph.forget_fine();
+        assert_eq!(unpacked(&graph), 0);
+    }
+
+    #[test]
+    fn finer_surfaces_of_many_scans_do_not_stay() {
+        let (scan, _) = hall(1).scans.remove(0);
+        let mut graph = ScanGraph::new();
+        for key in 1..=UNPACKED as u128 + 1 {
+            graph.add_scan(Arc::new(Scan::new(PreparedScan { key: ScanKey(key), ..scan.prepared.clone() })));
+        }
+        let unpack = |graph: &ScanGraph, count: usize| {
+            for scan in graph.scans.values().take(count) {
+                assert!(scan.fine().is_some());
+            }
+            graph.forget_fine_of_many();
+            unpacked(graph)
+        };
+        assert_eq!(unpack(&graph, UNPACKED), UNPACKED);
+        assert_eq!(unpack(&graph, UNPACKED + 1), 0);
+    }
+}

@@ -55,3 +55,58 @@ pub fn guarded(
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::cloud::ScanKey;
+    use crate::control::{CancelToken, Silent};
+    use crate::geometry::Pose;
+    use crate::graph::SupportOptions;
+    use crate::mapping::test_hall::Model;
+    use crate::pairwise::{Counts, Evidence, Hypothesis, PairKey, PairResult};
+
+    /// How far two scans of a hall end from where they belong, in voxels, by the pose graph alone and refined, if their pair is sure that one stands so many
+    /// voxels aside.
+    fn off(shift_voxels: f64) -> [f64; 2] {
+        let (model, options) = (Model::new(2), MappingOptions::default());
+        let voxel = model.hall.resolution;
+        let truth = model.contradiction((1, 2), true).a_from_b;
+        let counts = Counts { points: 1000, inliers: 500, ..Counts::default() };
+        let result = PairResult {
+            pair: PairKey::of(ScanKey(1), ScanKey(2)),
+            matches: Vec::new(),
+            hypotheses: vec![Hypothesis {
+                a_from_b: Pose::from_translation(Vector3::new(shift_voxels * voxel, 0.0, 0.0)) * truth,
+                evidence: Evidence { b_on_a: counts, a_on_b: counts, range_images: 2, ..Evidence::default() },
+                logit: 8.0,
+            }],
+        };
+        let mut graph = model.graph.clone();
+        graph.add_results([result], &SupportOptions::default());
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let mut spread = model.component.clone();
+        pose_graph(&graph, &mut spread, Reach::NEAR, voxel, &options, control).expect("nobody cancels");
+        let both = refined(&graph, &model.component, voxel, &options, control).expect("nobody cancels");
+        [spread, both].map(|component| {
+            let a_from_b = component.poses[&ScanKey(1)].inverse() * component.poses[&ScanKey(2)];
+            (a_from_b.translation - truth.translation).norm() / voxel
+        })
+    }
+
+    #[test]
+    fn what_an_edge_bends_into_free_space_is_adjusted_without_it() {
+        let far = 0.8 * MappingOptions::default().rival_voxels;
+        let [spread, refined] = off(far);
+        assert!(spread > 0.9 * far, "the edge moves it: {spread} of {far} voxels");
+        assert!(refined < 0.5, "surfaces alone hold it: {refined} voxels");
+        let [spread, refined] = off(1.0);
+        assert!(
+            spread > 0.9 && refined < 0.5,
+            "surfaces bring back what is near: {spread}, {refined} voxels"
+        );
+    }
+}

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use nalgebra::Vector3;
 
+use super::belief::hardly_believed;
 use super::candidates::{Backing, Candidate, moved, near, support_of};
 use super::close_look::objection;
 use super::component::Component;
@@ -27,12 +28,6 @@ const SECOND_LOOKS: usize = 6;
 const SURE: f64 = 2.0;
 /// … and clearly surer than another with as many more as this.
 const LEAD: f64 = 1.0;
-/// Log-odds that the pairs of a join give it by themselves, together and without limit, at least, unless its support is all that any level asks: as much as
-/// a firm pair is worth. Of 1,171 scans of simulated houses that several pairs placed right, 7 have less. …
-const LEAST_ALONE: f64 = 4.0;
-/// … And if one pair alone has a voice of its own, and support is not firm: one that turned a scan by 119 degrees has 4.8. Of 352 scans that one pair placed right,
-/// 45 do not pass these two.
-const LEAST_OF_ONE: f64 = 5.0;
 /// Edges whose own poses are tried where the fit to all of them fails.
 pub const SINGLE_STARTS: usize = 6;
 
@@ -191,16 +186,6 @@ pub fn weigh_join(
         }
     }
     Ok(Err(first_refusal.unwrap_or(Refusal::Support { found: 0.0, needed: level.support })))
-}
-
-/// Whether the pairs of a join hardly believe it by themselves, and its support is not all that any level asks. What one pair alone has a voice for must
-/// be firm besides, or surer.
-fn hardly_believed(candidate: &Candidate, backing: Backing, options: &MappingOptions) -> Option<Refusal> {
-    let own = candidate.members.iter().filter(|member| member.has_own_voice()).count();
-    let support = candidate.support.min(backing.support);
-    let needed = if own > 1 || support >= options.firm_support { LEAST_ALONE } else { LEAST_OF_ONE };
-    let alone = candidate.alone();
-    (alone < needed && support < options.most_support()).then_some(Refusal::Support { found: alone, needed })
 }
 
 /// Whether a second look at the pairs that speak for either of two poses finds the rival's clearly worse.
@@ -394,36 +379,6 @@ mod tests {
         let last = |results: Vec<Result<Pose, Refusal>>| results.last().copied();
         assert!(matches!(last(all(-0.9)), Some(Ok(_))), "{:?}", all(-0.9));
         assert_eq!(last(all(-1.1)), Some(Err(Refusal::Support { found: 0.0, needed: 1.5 })));
-    }
-
-    #[test]
-    fn pairs_that_hardly_believe_it_make_no_join_and_one_that_is_not_firm_must_be_surer() {
-        let (model, options) = (Model::new(2), MappingOptions::default());
-        let refusal_of = |pairs: usize, logit: f64, support: f64, backed: f64| {
-            let a_from_b = model.contradiction((1, 2), true).a_from_b;
-            let result = PairResult {
-                pair: PairKey::of(ScanKey(1), ScanKey(2)),
-                matches: Vec::new(),
-                hypotheses: vec![Hypothesis { a_from_b, evidence: Evidence::default(), logit }],
-            };
-            let mut graph = model.coarse();
-            graph.add_results([result], &SupportOptions::default());
-            let [a, b] = [1, 2].map(|key| Component::single(ScanKey(key)));
-            let mut found = candidates(&graph, &a, &b, model.hall.resolution, &options, CLUSTERS);
-            let one = found.remove(0);
-            let candidate = Candidate { support, members: vec![one.members[0]; pairs], ..one };
-            hardly_believed(&candidate, Backing { support: backed, edges: pairs }, &options)
-        };
-        assert_eq!(refusal_of(2, 2.1, 3.0, 3.0), None);
-        assert_eq!(refusal_of(2, 1.9, 3.0, 3.0), Some(Refusal::Support { found: 3.8, needed: LEAST_ALONE }));
-        let refusal = |logit, support, backed| refusal_of(1, logit, support, backed);
-        assert_eq!(refusal(5.1, 3.0, 3.0), None);
-        let weak = Some(Refusal::Support { found: 4.9, needed: LEAST_OF_ONE });
-        assert_eq!(refusal(4.9, 3.9, 4.0), weak);
-        assert_eq!(refusal(4.9, 4.0, 3.9), weak, "alignment left less");
-        assert_eq!(refusal(4.9, 4.0, 4.0), None);
-        assert_eq!(refusal(3.9, 4.0, 4.0), Some(Refusal::Support { found: 3.9, needed: LEAST_ALONE }));
-        assert_eq!(refusal(3.9, 8.0, 8.0), None, "third scans say all that can be said");
     }
 
     #[test]

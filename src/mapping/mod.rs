@@ -6,6 +6,7 @@
 //! continue, are created and merge, with closed-form and robust aggregation; `refine` is local and global bundle adjustment, pose graph
 //! and joint dense adjustment; `track_refinement` moves keypoints; `mapper` has one method a step and `policy` their order.
 
+mod belief;
 mod bent_join;
 mod borne_out;
 mod candidates;
