@@ -25,6 +25,9 @@ const AGAINST_SHARE: f64 = 0.5;
 const OVERWHELMING_SHARE: f64 = 2.0;
 /// … and at least this many pairs say the same.
 const AGAINST_PAIRS: usize = 2;
+/// Where alike places were folded onto each other, what is said with one voice mostly comes to more than this for each witness. Where it comes to less, and all
+/// of it is of one scan, that scan is wrong and not the rest: one that was turned by half in a laboratory had 0.032.
+const CLEAR_WEIGHT: f64 = 0.05;
 /// Contradictions whose separation is tried, the strongest first.
 const TRIED: usize = 8;
 
@@ -89,6 +92,11 @@ impl Case<'_> {
                 Some(Ruling::Open(scans)) => self.part(scans),
                 _ => None,
             };
+            if few.is_none()
+                && let Some(scan) = self.suspect()
+            {
+                return Ok(Finding::Torn { side: BTreeSet::from([scan]), strongest });
+            }
             return Ok(match few {
                 Some(scans) => Finding::Open { strongest: self.shown_by(&scans).unwrap_or(strongest), scans },
                 None => Finding::Folded { strongest },
@@ -121,6 +129,19 @@ impl Case<'_> {
     fn shown_by(&self, side: &BTreeSet<ScanKey>) -> Option<Contradiction> {
         let across = |c: &&Contradiction| side.contains(&c.pair.a) != side.contains(&c.pair.b);
         self.testimony.inside(self.component).find(across).copied()
+    }
+
+    /// The scan that all pairs which contradict are of, where they say little more together than chance may.
+    fn suspect(&self) -> Option<ScanKey> {
+        if self.testimony.condemns_by(CLEAR_WEIGHT) {
+            return None;
+        }
+        let mut pairs = self.testimony.contradictions.iter().map(|c| [c.pair.a, c.pair.b]);
+        let first = pairs.next()?;
+        let others: Vec<[ScanKey; 2]> = pairs.collect();
+        let in_all = |scan: &ScanKey| others.iter().all(|pair| pair.contains(scan));
+        let mut suspects = first.into_iter().filter(in_all);
+        suspects.next().filter(|scan| suspects.next().is_none() && self.component.poses.contains_key(scan))
     }
 
     /// A side that belongs elsewhere.
@@ -225,6 +246,7 @@ mod tests {
     use crate::control::{CancelToken, Silent};
     use crate::mapping::consistency::supports;
     use crate::mapping::test_hall::Model;
+    use crate::mapping::voice::Voice;
 
     #[test]
     fn scans_settle_where_everybody_says_they_belong() {
@@ -248,6 +270,31 @@ mod tests {
         assert_eq!(settles(&model.with_turned(&[5])), Ok(true));
         assert_eq!(settles(&model.component), Ok(false));
         assert_eq!(settles(&model.with_turned(&[4, 5])), Ok(false), "scan 4 is still at the wrong end");
+    }
+
+    #[test]
+    fn a_scan_that_all_contradictions_are_of_is_suspected_unless_they_weigh_much() {
+        let model = Model::new(6);
+        let options = MappingOptions::default();
+        let suspect = |pairs: &[(u128, u128)], agreeing: usize| {
+            let contradictions = pairs.iter().map(|pair| model.contradiction(*pair, false)).collect();
+            let voice = Voice { pairs: pairs.len(), evidence: 4.0 * pairs.len() as f64 };
+            let testimony = Testimony { agreeing, contradictions, voice, ruling: Some(Ruling::Believable) };
+            assert!(testimony.condemns(), "{pairs:?}, {agreeing}");
+            let case = Case {
+                graph: &model.graph,
+                component: &model.component,
+                supports: &BTreeMap::new(),
+                testimony: &testimony,
+                options: &options,
+            };
+            case.suspect()
+        };
+        assert_eq!(suspect(&[(1, 5), (2, 5)], 112), Some(ScanKey(5)));
+        assert_eq!(suspect(&[(1, 5), (2, 5)], 70), None, "of fewer witnesses it is much");
+        assert_eq!(suspect(&[(1, 5), (2, 5), (3, 5)], 112), None, "three say much");
+        assert_eq!(suspect(&[(1, 5), (2, 4)], 112), None, "either may be wrong, or the rest");
+        assert_eq!(suspect(&[(1, 5), (2, 5), (3, 4)], 180), None);
     }
 
     #[test]

@@ -124,9 +124,15 @@ impl Testimony {
     /// most 0.012 for each witness; where alike rooms were folded onto each other, one voice says 0.04 and more, mostly far more.
     #[must_use]
     pub fn condemns(&self) -> bool {
+        self.condemns_by(CONTRADICTED_WEIGHT)
+    }
+
+    /// The same where what is said must come to so much for each witness.
+    #[must_use]
+    pub fn condemns_by(&self, each: f64) -> bool {
         let weight = self.voice.evidence - WITNESS * self.voice.pairs as f64;
         self.voice.pairs >= CONTRADICTED_PAIRS
-            && weight >= (CONTRADICTED_WEIGHT * self.agreeing as f64).max(CONTRADICTED_LEAST)
+            && weight >= (each * self.agreeing as f64).max(CONTRADICTED_LEAST)
     }
 
     /// The contradictions between scans of a component, the surest first.
