@@ -9,7 +9,7 @@ use crate::storage::{StorageError, Store};
 
 /// Names the form and meaning of prepared scans, pair results and snapshots. Another one makes the cached ones of old programs
 /// unreachable, so it changes whenever the engine's numbers do.
-const ENGINE: &str = "engine/12";
+const ENGINE: &str = "engine/13";
 
 /// How many scans, by arrival, decide a project's resolution.
 pub const DECIDING_SCANS: u32 = 8;

@@ -7,8 +7,8 @@ use super::contacts::{Contacts, LANES, Motion, Numbers, meet};
 use crate::features::Scan;
 use crate::geometry::Pose;
 
-/// Points of the moving scan used, at most: evenly spread over it.
-const MAX_POINTS: usize = 1200;
+/// Points of the moving scan used, at most, evenly spread over it: in the first half of the iterations, and in the second.
+const POINTS: [usize; 2] = [600, 1200];
 const ITERATIONS: usize = 10;
 /// Correspondences farther than the gate are dropped; it shrinks from the first to the last iteration. Voxels.
 const GATE_VOXELS: (f32, f32) = (4.0, 1.6);
@@ -23,11 +23,12 @@ const CONVERGED_VOXELS: f64 = 0.002;
 #[must_use]
 pub fn icp(a: &Scan, b: &Scan, a_from_b: &Pose) -> Pose {
     let voxel = a.prepared.resolution;
-    let stride = b.prepared.points.len().div_ceil(MAX_POINTS).max(1);
+    let strides = POINTS.map(|points| b.prepared.points.len().div_ceil(points).max(1));
     let mut pose = *a_from_b;
     for iteration in 0..ITERATIONS {
         let share = iteration as f32 / (ITERATIONS - 1) as f32;
         let gate = (GATE_VOXELS.0 + (GATE_VOXELS.1 - GATE_VOXELS.0) * share) * voxel as f32;
+        let stride = strides[usize::from(share > 0.5)];
         let kernel = KERNEL_VOXELS * voxel as f32;
         let Some((hessian, gradient, centre)) = normal_equations(a, b, &pose, stride, gate, kernel) else {
             break;

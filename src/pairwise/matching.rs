@@ -2,14 +2,15 @@
 
 use multiversion::multiversion;
 
-use crate::features::{Columns, DESCRIPTOR_LEN, PreparedScan};
+use super::products::{Columns, Rows, UNIT};
+use crate::features::PreparedScan;
 
-/// Rows of the similarity matrix computed at a time: 12 x 2000 floats stay near until their bests are found.
+/// Rows of the similarity matrix computed at a time: 12 x 2000 numbers stay near until their bests are found.
 const BLOCK: usize = 12;
 /// Rows taken together into the columns' bests, so that those pass through the cache once for all of them.
 const TOGETHER: usize = 4;
 /// Less than any similarity that counts.
-const NOTHING: f32 = -1.0;
+const NOTHING: i16 = -1;
 
 /// Two keypoints that are each other's nearest in descriptor space.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,33 +33,34 @@ pub fn mutual_matches(a: &PreparedScan, b: &PreparedScan, limit: usize) -> Vec<M
 
 /// The same of any descriptors, each [`DESCRIPTOR_LEN`] numbers; keypoint numbers count from the first given.
 pub(super) fn mutual(a: &[f32], b: &[f32], limit: usize) -> Vec<Match> {
-    let (rows, columns) = (a.len() / DESCRIPTOR_LEN, b.len() / DESCRIPTOR_LEN);
-    if rows == 0 || columns == 0 {
+    let (rows, columns) = (Rows::new(a), Rows::new(b));
+    let (height, width) = (rows.len(), columns.len());
+    if height == 0 || width == 0 {
         return Vec::new();
     }
-    let mut by_column = Best::new(columns);
-    let mut by_row: Vec<RowBest> = Vec::with_capacity(rows);
-    let across = Columns::new(b);
-    let mut block = vec![0.0_f32; BLOCK * across.stride()];
-    let nothing = vec![NOTHING; columns];
-    for (some, rows) in a.chunks(BLOCK * DESCRIPTOR_LEN).enumerate() {
-        across.multiply(rows, &mut block);
-        let height = rows.len() / DESCRIPTOR_LEN;
-        for row in (0..height).step_by(TOGETHER) {
-            let lines: [&[f32]; TOGETHER] = std::array::from_fn(|k| {
-                let line = (row + k) * across.stride();
-                if row + k < height { &block[line..line + columns] } else { &nothing }
+    let mut by_column = Best::new(width);
+    let mut by_row: Vec<RowBest> = Vec::with_capacity(height);
+    let across = Columns::new(&columns);
+    let stride = across.stride();
+    let mut block = vec![0_i16; BLOCK * stride];
+    let nothing = vec![NOTHING; width];
+    for first in (0..height).step_by(BLOCK) {
+        let made = across.multiply(&rows, first, &mut block);
+        for row in (0..made).step_by(TOGETHER) {
+            let lines: [&[i16]; TOGETHER] = std::array::from_fn(|k| {
+                let line = (row + k) * stride;
+                if row + k < made { &block[line..line + width] } else { &nothing }
             });
-            by_row.extend(lines.iter().take(height - row).map(|line| RowBest::of(line)));
-            by_column.update(lines, (some * BLOCK + row) as u32);
+            by_row.extend(lines.iter().take(made - row).map(|line| RowBest::of(line)));
+            by_column.update(lines, (first + row) as u16);
         }
     }
-    let mut matches: Vec<Match> = Vec::with_capacity(rows.min(columns));
-    for column in 0..columns {
+    let mut matches: Vec<Match> = Vec::with_capacity(height.min(width));
+    for column in 0..width {
         let (first, row) = (by_column.first[column], by_column.index[column] as usize);
         let RowBest { best, second, tied } = by_row[row];
         // The greatest of its column is the greatest of its row too, and if there are several, the first of them.
-        if first > 0.0 && first == best && tied.is_none_or(|first_column| first_column == column) {
+        if first > 0 && first == best && tied.is_none_or(|first_column| first_column == column) {
             let ambiguity = ratio(best, second) * ratio(first, by_column.second[column]);
             matches.push(Match { a: row as u16, b: column as u16, ambiguity });
         }
@@ -68,21 +70,22 @@ pub(super) fn mutual(a: &[f32], b: &[f32], limit: usize) -> Vec<Match> {
     matches
 }
 
-/// Distance ratio of two similarities of unit vectors: |x - y|^2 = 2 - 2 x.y.
-fn ratio(best: f32, second: f32) -> f32 {
-    ((1.0 - best).max(0.0) / (1.0 - second).max(1e-6)).min(1.0).sqrt()
+/// Distance ratio of two similarities of unit vectors: |x - y|^2 = 2 - 2 x.y. Of what is too near to tell apart, neither is nearer.
+fn ratio(best: i16, second: i16) -> f32 {
+    let square = |similarity: i16| (UNIT - f32::from(similarity)).max(1.0);
+    (square(best) / square(second)).min(1.0).sqrt()
 }
 
 /// The two largest values of a row.
 struct RowBest {
-    best: f32,
-    second: f32,
+    best: i16,
+    second: i16,
     /// Where several are the largest, the first of them. A single one is found from its column, without a search.
     tied: Option<usize>,
 }
 
 impl RowBest {
-    fn of(line: &[f32]) -> Self {
+    fn of(line: &[i16]) -> Self {
         let (best, second) = top_two(line);
         let tied = if best == second { line.iter().position(|x| *x == best) } else { None };
         Self { best, second, tied }
@@ -91,9 +94,9 @@ impl RowBest {
 
 /// The two largest values of each column seen so far, and where the largest is.
 struct Best {
-    first: Vec<f32>,
-    second: Vec<f32>,
-    index: Vec<u32>,
+    first: Vec<i16>,
+    second: Vec<i16>,
+    index: Vec<u16>,
 }
 
 impl Best {
@@ -102,36 +105,36 @@ impl Best {
     }
 
     /// Takes rows in, of which the first has number `row`.
-    fn update(&mut self, lines: [&[f32]; TOGETHER], row: u32) {
+    fn update(&mut self, lines: [&[i16]; TOGETHER], row: u16) {
         update_columns(lines, row, &mut self.first, &mut self.second, &mut self.index);
     }
 }
 
-#[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
+#[multiversion(targets("x86_64+avx512f+avx512bw", "x86_64+avx2", "aarch64+neon"))]
 fn update_columns(
-    [w, x, y, z]: [&[f32]; TOGETHER],
-    row: u32,
-    best: &mut [f32],
-    second: &mut [f32],
-    index: &mut [u32],
+    [w, x, y, z]: [&[i16]; TOGETHER],
+    row: u16,
+    best: &mut [i16],
+    second: &mut [i16],
+    index: &mut [u16],
 ) {
     let n = best.len();
     let (w, x, y, z) = (&w[..n], &x[..n], &y[..n], &z[..n]);
     let (second, index) = (&mut second[..n], &mut index[..n]);
     for i in 0..n {
         let (mut top, mut next, mut at) = (best[i], second[i], index[i]);
-        for (value, row) in [(w[i], row), (x[i], row + 1), (y[i], row + 2), (z[i], row + 3)] {
+        for (value, further) in [(w[i], 0), (x[i], 1), (y[i], 2), (z[i], 3)] {
             let lower = if value < top { value } else { top };
             next = if lower > next { lower } else { next };
-            at = if value > top { row } else { at };
+            at = if value > top { row.wrapping_add(further) } else { at };
             top = if value > top { value } else { top };
         }
         (best[i], second[i], index[i]) = (top, next, at);
     }
 }
 
-#[multiversion(targets("x86_64+avx512f", "x86_64+avx2", "aarch64+neon"))]
-fn top_two(line: &[f32]) -> (f32, f32) {
+#[multiversion(targets("x86_64+avx512f+avx512bw", "x86_64+avx2", "aarch64+neon"))]
+fn top_two(line: &[i16]) -> (i16, i16) {
     // So many that the comparisons of one chunk do not wait for those of the last.
     const LANES: usize = 64;
     let mut best = [NOTHING; LANES];
@@ -175,21 +178,21 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_two_largest_are_found(line in prop::collection::vec(0.0..1.0f32, 2..200)) {
+        fn the_two_largest_are_found(line in prop::collection::vec(0..i16::MAX, 2..200)) {
             let mut sorted = line.clone();
-            sorted.sort_by(|a, b| b.total_cmp(a));
+            sorted.sort_by(|a, b| b.cmp(a));
             prop_assert_eq!(top_two(&line), (sorted[0], sorted[1]));
         }
 
         #[test]
-        fn columns_keep_their_two_largest(a in prop::collection::vec(0.0..1.0f32, 2..50)) {
+        fn columns_keep_their_two_largest(a in prop::collection::vec(0..i16::MAX, 2..50)) {
             let mut best = Best::new(1);
             for (row, x) in a.chunks(TOGETHER).enumerate() {
                 let lines = std::array::from_fn(|k| x.get(k).map_or(&[NOTHING][..], std::slice::from_ref));
-                best.update(lines, (row * TOGETHER) as u32);
+                best.update(lines, (row * TOGETHER) as u16);
             }
             let mut sorted = a.clone();
-            sorted.sort_by(|x, y| y.total_cmp(x));
+            sorted.sort_by(|x, y| y.cmp(x));
             prop_assert_eq!((best.first[0], best.second[0]), (sorted[0], sorted[1]));
             prop_assert_eq!(a[best.index[0] as usize], sorted[0]);
         }

@@ -13,6 +13,7 @@ mod matching;
 mod pair;
 mod planar;
 mod probe;
+mod products;
 mod second_look;
 mod shortlist;
 #[cfg(test)]
