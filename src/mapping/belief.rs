@@ -9,7 +9,7 @@ use super::options::MappingOptions;
 const LEAST_ALONE: f64 = 4.0;
 /// … And if one pair alone has a voice of its own, and support is not firm: one that turned a scan by 119 degrees has 4.8. Of 352 scans that one pair placed right,
 /// 45 do not pass these two.
-const LEAST_OF_ONE: f64 = 5.0;
+pub const LEAST_OF_ONE: f64 = 5.0;
 
 /// Whether the pairs of a join hardly believe it by themselves, and its support is not all that any level asks. What one pair alone has a voice for must
 /// be firm besides, or surer.
