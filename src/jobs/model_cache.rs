@@ -38,10 +38,14 @@ impl ModelCache {
         models.drain(..forgotten);
     }
 
-    /// Keeps the model of a version in place of an older one of the project.
+    /// Keeps the model of a version in place of an older one of the project. The finer surfaces of others give their memory back: only the project that
+    /// was worked on last keeps them, for the scan that arrives next.
     pub fn put(&self, project: ProjectId, version: VersionNumber, model: LiveModel) {
         let mut models = self.models.lock().unwrap_or_else(PoisonError::into_inner);
         models.retain(|(p, _, _)| *p != project);
+        for (_, _, other) in models.iter() {
+            other.forget_fine();
+        }
         models.push_back((project, version, model));
         while models.len() > CAPACITY {
             models.pop_front();
@@ -51,8 +55,12 @@ impl ModelCache {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
+    use crate::control::{CancelToken, Control, Silent};
     use crate::mapping::MappingOptions;
+    use crate::pairwise::test_survey::hall;
 
     #[test]
     fn only_the_asked_version_is_found_and_the_oldest_project_goes_first() {
@@ -66,5 +74,21 @@ mod tests {
         assert!(cache.get(ids[4], VersionNumber(2)).is_none());
         cache.keep_newest(1);
         assert!(cache.knows(ids[4]) && !ids[..4].iter().any(|id| cache.knows(*id)));
+    }
+    #[test]
+    fn only_the_project_that_was_worked_on_last_keeps_finer_surfaces() {
+        let token = CancelToken::new();
+        let control = Control { cancel: &token, observer: &Silent };
+        let mut model = LiveModel::new(MappingOptions::default());
+        let scans = hall(2).scans.into_iter().map(|(scan, _)| Arc::new(scan.prepared)).collect();
+        model.register(scans, control).expect("nobody cancels");
+        let kept = model.clone();
+        let unpacked = || kept.graph().scans().filter(|scan| scan.is_unpacked()).count();
+        let (cache, first, second) = (ModelCache::default(), ProjectId(1.into()), ProjectId(2.into()));
+        cache.put(first, VersionNumber(1), model);
+        assert_eq!(unpacked(), 2);
+        cache.put(second, VersionNumber(1), LiveModel::new(MappingOptions::default()));
+        assert_eq!(unpacked(), 0);
+        assert!(cache.knows(first), "the model itself stays");
     }
 }

@@ -233,8 +233,17 @@ impl LiveModel {
         let voxel = self.voxel();
         let grown =
             grow(&mut self.mapper, &mut self.graph, voxel, &self.options, &mut self.new_pairs, control);
-        self.graph.forget_fine();
+        if grown.is_ok() {
+            self.graph.forget_fine_of_many();
+        } else {
+            self.graph.forget_fine();
+        }
         grown
+    }
+
+    /// Gives back the memory of finer surfaces, which those of few scans keep for what arrives next ([`Scan::fine`]).
+    pub fn forget_fine(&self) {
+        self.graph.forget_fine();
     }
 
     /// Runs an operation on every component and keeps, component by component, what improves the held-out measure.

@@ -90,7 +90,7 @@ impl Mapper {
             }
             Ok(bridge(component, supports, options.firm_support))
         })?;
-        graph.forget_fine();
+        graph.forget_fine_of_many();
         self.sort_components();
         Ok(())
     }
