@@ -69,7 +69,7 @@ pub(super) fn svg(reliability: Option<&Reliability>) -> String {
     let middle = x(0.5);
     let _ = writeln!(
         svg,
-        "<text x=\"{LEFT}\" y=\"24\" font-size=\"15\">Held-out predictions of the verifier: expected error {:.1} %</text>\n\
+        "<text x=\"{middle}\" y=\"24\" font-size=\"15\" text-anchor=\"middle\">Held-out predictions: expected error {:.1} %</text>\n\
          <text x=\"{middle}\" y=\"{:.1}\" text-anchor=\"middle\">predicted probability that a pose is right</text>\n\
          <text transform=\"translate(22 {:.1}) rotate(-90)\" text-anchor=\"middle\">share that is right</text>\n\
          <text x=\"{middle}\" y=\"{:.1}\" text-anchor=\"middle\">number of predictions, up to {}, on a logarithmic scale</text>\n</svg>",
