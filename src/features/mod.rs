@@ -23,5 +23,4 @@ pub use range_image::{RangeImage, Visibility};
 pub use resolution::{choose_resolution, extent, natural_resolution};
 pub use sensor::{SensorPosition, Stance, Surfaces, Viewpoint, viewpoint};
 pub use signature::{SIGNATURE_LEN, signature};
-pub use similarity::Columns;
 pub use surfel::Surfel;

@@ -1,4 +1,5 @@
-//! Similarities of many descriptors with many: dot products, a tile of some rows and columns at a time whose sums stay in registers.
+//! Similarities of many descriptors with many: dot products, a tile of some rows and columns at a time whose sums stay in registers. In single precision, as
+//! what they are multiplied with are not all descriptors; those of two scans are matched in whole numbers.
 
 use pulp::{Arch, Simd, WithSimd};
 

@@ -11,14 +11,15 @@ use super::memo::Memo;
 use super::support::{Corrections, SupportOptions, support};
 use crate::cloud::ScanKey;
 use crate::control::{Cancelled, Control, Stage};
-use crate::features::Scan;
+use crate::features::{FineSurface, Scan};
 use crate::geometry::Pose;
 use crate::pairwise::{Hypothesis, PairKey, PairResult, Probe, match_pair, probe};
 
 /// Pairs that are matched before the memory that their close looks took is given back, if it is much.
 const BLOCK: usize = 512;
-/// Scans whose finer surfaces stay in memory from one block of pairs, or one join that is weighed, to the next, at most.
-const UNPACKED: usize = 64;
+/// Points of finer surfaces that stay in memory from one block of pairs, one join that is weighed or one scan that arrives to the next, at most: those of about 60 rooms. Each takes some
+/// 150 bytes, mostly in its lookup grid.
+const UNPACKED_POINTS: usize = 2_500_000;
 
 /// A hypothesis with what third scans say of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -213,9 +214,16 @@ impl ScanGraph {
         }
     }
 
-    /// The same where more than 64 scans have taken it.
+    /// The same where it is much.
     pub fn forget_fine_of_many(&self) {
-        if self.scans.values().filter(|scan| scan.is_unpacked()).count() > UNPACKED {
+        self.forget_fine_beyond(UNPACKED_POINTS);
+    }
+
+    /// The same where they have more points than this.
+    fn forget_fine_beyond(&self, most: usize) {
+        let unpacked = self.scans.values().filter(|scan| scan.is_unpacked());
+        let points = unpacked.filter_map(|scan| scan.prepared.fine.as_ref()).map(FineSurface::count);
+        if points.sum::<usize>() > most {
             self.forget_fine();
         }
     }
@@ -332,7 +340,6 @@ fn in_steps(correction: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::control::{CancelToken, Observer, Progress, Silent};
-    use crate::features::PreparedScan;
     use crate::pairwise::test_survey::hall;
 
     /// Cancels once anything is done.
@@ -367,7 +374,9 @@ mod tests {
         let token = CancelToken::new();
         let impatient = Impatient(token.clone());
         let control = Control { cancel: &token, observer: &impatient };
-        assert!(graph.try_pairs(&pairs, &options, control).is_err());
+        // By one thread, which looks whether it is cancelled before the second pair.
+        let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
+        assert!(alone.install(|| graph.try_pairs(&pairs, &options, control)).is_err());
         assert_eq!((unpacked(&graph), graph.edges().count()), (0, 0));
         let token = CancelToken::new();
         let control = Control { cancel: &token, observer: &Silent };
@@ -375,25 +384,11 @@ mod tests {
         assert_eq!((unpacked(&graph), found.len()), (3, 3), "all are likely, so all are looked at closely");
         graph.forget_fine_of_many();
         assert_eq!(unpacked(&graph), 3, "three are not many");
-        graph.forget_fine();
+        let points =
+            graph.scans().map(|scan| scan.prepared.fine.as_ref().map_or(0, FineSurface::count)).sum();
+        graph.forget_fine_beyond(points);
+        assert_eq!(unpacked(&graph), 3);
+        graph.forget_fine_beyond(points - 1);
         assert_eq!(unpacked(&graph), 0);
-    }
-
-    #[test]
-    fn finer_surfaces_of_many_scans_do_not_stay() {
-        let (scan, _) = hall(1).scans.remove(0);
-        let mut graph = ScanGraph::new();
-        for key in 1..=UNPACKED as u128 + 1 {
-            graph.add_scan(Arc::new(Scan::new(PreparedScan { key: ScanKey(key), ..scan.prepared.clone() })));
-        }
-        let unpack = |graph: &ScanGraph, count: usize| {
-            for scan in graph.scans.values().take(count) {
-                assert!(scan.fine().is_some());
-            }
-            graph.forget_fine_of_many();
-            unpacked(graph)
-        };
-        assert_eq!(unpack(&graph, UNPACKED), UNPACKED);
-        assert_eq!(unpack(&graph, UNPACKED + 1), 0);
     }
 }

@@ -38,14 +38,26 @@ impl ModelCache {
         models.drain(..forgotten);
     }
 
-    /// Keeps the model of a version in place of an older one of the project. The finer surfaces of others give their memory back: only the project that
-    /// was worked on last keeps them, for the scan that arrives next.
+    /// Gives back the memory that finer surfaces take in the models of all projects but this: only the one that is worked on keeps them, for the scan
+    /// that arrives next.
+    pub fn forget_fine_of_others(&self, project: ProjectId) {
+        let models = self.models.lock().unwrap_or_else(PoisonError::into_inner);
+        for (_, _, other) in models.iter().filter(|(p, _, _)| *p != project) {
+            other.forget_fine();
+        }
+    }
+
+    /// The same of all projects.
+    pub fn forget_fine(&self) {
+        for (_, _, model) in self.models.lock().unwrap_or_else(PoisonError::into_inner).iter() {
+            model.forget_fine();
+        }
+    }
+
+    /// Keeps the model of a version in place of an older one of the project.
     pub fn put(&self, project: ProjectId, version: VersionNumber, model: LiveModel) {
         let mut models = self.models.lock().unwrap_or_else(PoisonError::into_inner);
         models.retain(|(p, _, _)| *p != project);
-        for (_, _, other) in models.iter() {
-            other.forget_fine();
-        }
         models.push_back((project, version, model));
         while models.len() > CAPACITY {
             models.pop_front();
@@ -76,7 +88,7 @@ mod tests {
         assert!(cache.knows(ids[4]) && !ids[..4].iter().any(|id| cache.knows(*id)));
     }
     #[test]
-    fn only_the_project_that_was_worked_on_last_keeps_finer_surfaces() {
+    fn only_the_project_that_is_worked_on_keeps_finer_surfaces() {
         let token = CancelToken::new();
         let control = Control { cancel: &token, observer: &Silent };
         let mut model = LiveModel::new(MappingOptions::default());
@@ -86,8 +98,12 @@ mod tests {
         let unpacked = || kept.graph().scans().filter(|scan| scan.is_unpacked()).count();
         let (cache, first, second) = (ModelCache::default(), ProjectId(1.into()), ProjectId(2.into()));
         cache.put(first, VersionNumber(1), model);
+        cache.forget_fine_of_others(first);
         assert_eq!(unpacked(), 2);
-        cache.put(second, VersionNumber(1), LiveModel::new(MappingOptions::default()));
+        cache.forget_fine_of_others(second);
+        assert_eq!(unpacked(), 0);
+        assert!(kept.graph().scans().all(|scan| scan.fine().is_some()) && unpacked() == 2);
+        cache.forget_fine();
         assert_eq!(unpacked(), 0);
         assert!(cache.knows(first), "the model itself stays");
     }

@@ -105,12 +105,7 @@ impl LiveModel {
         }
         let pairs = retrieve(&Retrieval::new(&next.graph), fresh, next.options.retrieved, control)?;
         next.try_pairs(&pairs, control)?;
-        let loosened = next.mapper.loosen(&next.graph, next.options.firm_support, &next.options, control);
-        if loosened.is_err() {
-            // The scans are shared with this model, and what matching unpacked of them would stay.
-            next.graph.forget_fine();
-        }
-        loosened?;
+        next.loosen(control)?;
         next.grow(control)?;
         *self = next;
         Ok(())
@@ -129,7 +124,7 @@ impl LiveModel {
         let mut next = self.clone();
         next.options.decisions = decisions;
         next.mapper.reopen(&concerned);
-        next.mapper.loosen(&next.graph, next.options.firm_support, &next.options, control)?;
+        next.loosen(control)?;
         next.grow(control)?;
         *self = next;
         Ok(())
@@ -227,6 +222,15 @@ impl LiveModel {
     fn try_pairs(&mut self, pairs: &BTreeSet<PairKey>, control: Control<'_>) -> Result<(), Cancelled> {
         self.new_pairs.extend(self.graph.try_pairs(pairs, &self.options.support, control)?);
         Ok(())
+    }
+
+    fn loosen(&mut self, control: Control<'_>) -> Result<(), Cancelled> {
+        let loosened = self.mapper.loosen(&self.graph, self.options.firm_support, &self.options, control);
+        if loosened.is_err() {
+            // The scans are shared with the model as it was, and what matching unpacked of them would stay.
+            self.graph.forget_fine();
+        }
+        loosened
     }
 
     fn grow(&mut self, control: Control<'_>) -> Result<(), Cancelled> {

@@ -20,7 +20,7 @@ const WIDTH: usize = 32;
 /// Rows and vectors of a tile: twelve sums at once, as many as small register files hold beside what is multiplied.
 const ROWS: usize = 6;
 const VECTORS: usize = 2;
-/// Columns that a vector's eighth of 128 bits holds sums of. Two vectors are shortened into one by eighths in turns.
+/// Sums in a lane of 128 bits. Two vectors are shortened into one lane by lane in turns.
 const TURN: usize = 4;
 
 /// Some columns: for every pair of numbers two vectors of the widest machine.
@@ -109,10 +109,10 @@ trait Vectors: Copy {
     type Sums: Copy;
 
     fn zero(self) -> Self::Sums;
-    fn same(self, pair: Pair) -> Self::Pairs;
+    fn splat(self, pair: Pair) -> Self::Pairs;
     /// Of columns that lie side by side, the first [`Vectors::LANES`] or those after so many times as many.
     fn load(self, columns: &Side, part: usize) -> Self::Pairs;
-    fn plus_products(self, sums: Self::Sums, x: Self::Pairs, y: Self::Pairs) -> Self::Sums;
+    fn multiply_add(self, sums: Self::Sums, x: Self::Pairs, y: Self::Pairs) -> Self::Sums;
     /// Writes the sums of two vectors, [`TURN`] from either in turns, without their last bits.
     fn store(self, sums: [Self::Sums; VECTORS], into: &mut [i16]);
 }
@@ -132,7 +132,7 @@ impl Vectors for AnyMachine {
     }
 
     #[inline]
-    fn same(self, pair: Pair) -> Self::Pairs {
+    fn splat(self, pair: Pair) -> Self::Pairs {
         [pair; 8]
     }
 
@@ -142,7 +142,7 @@ impl Vectors for AnyMachine {
     }
 
     #[inline]
-    fn plus_products(self, sums: Self::Sums, x: Self::Pairs, y: Self::Pairs) -> Self::Sums {
+    fn multiply_add(self, sums: Self::Sums, x: Self::Pairs, y: Self::Pairs) -> Self::Sums {
         let product = |x: i16, y: i16| i32::from(x) * i32::from(y);
         std::array::from_fn(|lane| {
             let ([x, other_x], [y, other_y]) = (x[lane], y[lane]);
@@ -176,7 +176,7 @@ macro_rules! vectors {
             }
 
             #[inline(always)]
-            fn same(self, pair: Pair) -> Self::Pairs {
+            fn splat(self, pair: Pair) -> Self::Pairs {
                 pulp::cast(self.$splat(pulp::cast(pair)))
             }
 
@@ -187,7 +187,7 @@ macro_rules! vectors {
             }
 
             #[inline(always)]
-            fn plus_products(self, sums: Self::Sums, x: Self::Pairs, y: Self::Pairs) -> Self::Sums {
+            fn multiply_add(self, sums: Self::Sums, x: Self::Pairs, y: Self::Pairs) -> Self::Sums {
                 self.$add(sums, self.$products(x, y))
             }
 
@@ -279,9 +279,9 @@ fn tile<V: Vectors>(
         let [x, y] = &panel[k];
         let columns = [vectors.load(x, part), vectors.load(y, part)];
         for (sums, row) in sums.iter_mut().zip(rows) {
-            let same = vectors.same(row[k]);
+            let same = vectors.splat(row[k]);
             for (sum, columns) in sums.iter_mut().zip(columns) {
-                *sum = vectors.plus_products(*sum, same, columns);
+                *sum = vectors.multiply_add(*sum, same, columns);
             }
         }
     }
@@ -345,9 +345,14 @@ mod tests {
 
     #[test]
     fn what_is_no_unit_vector_does_no_harm() {
-        let wild = [f32::NAN, f32::INFINITY, -1e30, 7.0].repeat(DESCRIPTOR_LEN);
+        let mut wild = [f32::NAN, f32::INFINITY, -1e30, 7.0].repeat(DESCRIPTOR_LEN);
+        wild[..DESCRIPTOR_LEN].fill(-1e30);
         let rows = Rows::new(&wild);
         let columns = Columns::new(&rows);
+        let plainly = all(&rows, &columns, |rows, columns, products| {
+            Product { vectors: AnyMachine, rows, columns, products }.call();
+        });
+        assert_eq!(all(&rows, &columns, dispatch), plainly, "sums that overflow are alike, too");
         let mut products = vec![0; 4 * columns.stride()];
         assert_eq!(columns.multiply(&rows, 0, &mut products), 4);
         assert_eq!(columns.multiply(&rows, 3, &mut products), 1);

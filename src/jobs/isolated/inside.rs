@@ -55,6 +55,7 @@ pub async fn work_for_service(
                 continue;
             }
         };
+        performer.models.forget_fine_of_others(claim.job.project);
         if !performer.models.knows(claim.job.project) && performer.is_half_full() {
             performer.models.keep_newest(0);
         }
@@ -78,6 +79,9 @@ pub async fn work_for_service(
         }
         if !stopped {
             return Ok(());
+        }
+        if performer.is_half_full() {
+            performer.models.forget_fine();
         }
         if performer.is_half_full() {
             performer.models.keep_newest(1);
