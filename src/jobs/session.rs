@@ -70,6 +70,7 @@ pub(super) struct Session {
 impl Session {
     /// Opens the newest version of a project's model. Deleted scans whose removals failed are left out of it.
     pub async fn open(task: &Task, id: ProjectId) -> Result<Self, JobError> {
+        task.models.forget_fine_of_others(id);
         let project = task.store.project(id).await?;
         let parameters = Parameters::choose(&task.store, &project).await?;
         let kept = task.store.all_decisions(project.id).await?;

@@ -55,7 +55,6 @@ pub async fn work_for_service(
                 continue;
             }
         };
-        performer.models.forget_fine_of_others(claim.job.project);
         if !performer.models.knows(claim.job.project) && performer.is_half_full() {
             performer.models.keep_newest(0);
         }
